@@ -97,7 +97,9 @@ RECIPES = {
         same("validation", "positions"),
     ),
     "trade": Recipe(
-        "10 min", "lnocl bench --size 1024 -o $OUT/trade", {"validation/trade.png": "trade.png"}
+        "10 min",
+        "python benchmarks/trade.py --output $OUT/trade",
+        same("validation", "trade"),
     ),
     "psf_wrong": Recipe(
         "5 min",

@@ -455,10 +455,12 @@ def _detections(outcome: Outcome, null: Null, found: ScoreMap, least: float) -> 
     kinds = np.full(len(places), POINT_SOURCE, dtype="U8")
     pixels = (places - (q - 1) / 2.0) / q
     raised = halo_errors(outcome.estimate).raised
+    # Beside its own light the flux of a bright source is steep, and not to be interpolated.
+    is_steep = fluxes - found.fluxes[at] > errors
     for i, place in enumerate(places):
         if found.width:
             kinds[i] = EXTENDED
-        elif found.light_round(place, values[i], null.resolution) > CLEAR:
+        elif is_steep[i] or found.light_round(place, values[i], null.resolution) > CLEAR:
             fluxes[i], errors[i] = point_flux(
                 outcome.estimate, pixels[i], fluxes[i], outcome.moves, raised
             )

@@ -223,11 +223,8 @@ def deconvolve_tiles(
     """
     check_parallel(parallel)
     check_observation(observation)
-    if len(observation.halos):
-        raise InputError(
-            "a tile cannot tell the `halos` in it from a smooth sky, as whole images can; take "
-            "deconvolve for the whole, or leave `halos` out"
-        )
+    if reason := for_the_whole(observation):
+        raise InputError(reason)
     if unknown := sorted(options.keys() - OPTIONS):
         raise InputError(
             f"{unknown[0]} is no option of tiles; leave it out, or take deconvolve for the whole"
@@ -284,6 +281,16 @@ def _ending(prepared: Prepared, choice: Result) -> Prepared:
     if choice.stop_reason != prepared.stop:  # there was no end, and this is the steady run
         prepared = replace(prepared, steady=None, fits=False)
     return replace(prepared, stop=None)
+
+
+def for_the_whole(observation: Observation) -> str | None:
+    """Return why an observation is not for tiles, and what to do; None where it is."""
+    if len(observation.halos):
+        return (
+            "a tile cannot tell the `halos` in it from a smooth sky, as whole images can; take "
+            "deconvolve for the whole, or leave `halos` out"
+        )
+    return None
 
 
 def _choose(tiles: Sequence[Tile], parallel: Parallel, prepared: Prepared) -> Result:

@@ -323,6 +323,6 @@ def test_equal_psfs_of_a_field_give_what_one_gives(result, found):
     observation = lnocl.Observation(images, field, background=SKY)
     options = {"stop": None, "n_iter": 60, "engine": "numpy"}
     again = lnocl.deconvolve(observation, [STAR], **options).significance()
-    for name in ("signal_to_noise", "fluxes", "errors"):
+    for name in ("signal_to_noise", "flux", "flux_error"):
         here, there = getattr(again, name), getattr(found, name)
-        np.testing.assert_allclose(here, there, rtol=1e-6, atol=1e-6)
+        np.testing.assert_allclose(here, there, rtol=1e-6, atol=1e-4)

@@ -1,5 +1,6 @@
 """Tiles, and PSFs that vary over the field: against the whole, and against a PSF for each pixel."""
 
+import argparse
 import re
 
 import numpy as np
@@ -14,6 +15,7 @@ from scipy.signal import fftconvolve
 import lnocl
 from lnocl import PsfField, tiles, tiling
 from lnocl.commands import cli
+from lnocl.commands.deconvolve import in_tiles
 from lnocl.errors import InputError
 from lnocl.scene.shifting import MovablePsf
 
@@ -133,6 +135,20 @@ def test_fields_must_serve_all_images():
         lnocl.Observation(images, [one, other, one])
     with pytest.raises(InputError, match="psf 0 has the sum 0"):
         lnocl.Observation(images, PsfField(np.zeros((1, 3, 3)), [(0, 0)]))
+
+
+@pytest.mark.parametrize(
+    ("known", "tile", "are_tiles"),
+    [
+        ({}, None, True),
+        ({"transforms": [np.eye(2, 3), [[0, -1, N - 1], [1, 0, 0]]]}, None, False),
+        ({"epochs": [0, 1]}, None, False),
+        ({"epochs": [0, 1]}, 48, True),  # which is refused
+    ],
+)
+def test_the_shell_takes_tiles_where_psfs_vary_and_tiles_take_the_images(known, tile, are_tiles):
+    observation = lnocl.Observation(np.ones((2, N, N)), [make_field()] * 2, **known)
+    assert in_tiles(argparse.Namespace(tile=tile), observation) == are_tiles
 
 
 # --- Stars through the PSFs of their own places

@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from lnocl.commands import deconvolve, messages
+from lnocl.commands import deconvolve
 from lnocl.commands.parser import Parser
 from lnocl.errors import FileError, InputError, note
-from lnocl.process import ignored_warnings
+from lnocl.process import ignored_notes, ignored_warnings
 from lnocl.result.kept import from_parts
 
 if TYPE_CHECKING:
@@ -70,13 +70,13 @@ class Again:
         with atomic.kept(os.path.join(folder, each) for each in inputs):
             check()
         try:
-            with contextlib.chdir(folder), ignored_warnings():  # which were shown once
+            with contextlib.chdir(folder), ignored_warnings(), ignored_notes():  # shown once
                 frames, given = deconvolve.read(run)
         except (FileNotFoundError, NotADirectoryError, PermissionError) as error:
             raise FileError(
                 f"{folder}, where {path} was made, is not there: deconvolve again"
             ) from error
-        if run.tile is not None or frames.observation.psf_fields:
+        if deconvolve.in_tiles(run, frames.observation):
             raise InputError(
                 f"{path} was made in tiles, and this is of one run: deconvolve a cut-out without "
                 "tiles"
@@ -114,15 +114,11 @@ class Again:
                 if parts
                 else f"{path} does not hold what its run has found"
             )
-            with messages.shown_log(self.run.quiet):
-                note("%s: the run is made again", why)
-            found = self._solve()
+            note("%s: the run is made again", why)
+            with ignored_warnings(), ignored_notes():
+                found = deconvolve.solve(self.run, self.frames, self.given)._outcome
         self._refuse_another(found)
         return found
-
-    def _solve(self) -> Outcome:
-        with messages.shown_log(self.run.quiet, name=messages.PROGRESS), ignored_warnings():
-            return deconvolve.solve(self.run, self.frames, self.given)._outcome
 
     def _refuse_another(self, found: Outcome) -> None:
         expected = self.saved.extended * self.frames.electrons

@@ -18,7 +18,7 @@ from contextlib import closing
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
-from lnocl.commands import deconvolve, environment, messages, options, pictures, running
+from lnocl.commands import deconvolve, environment, options, pictures, running
 from lnocl.commands.options import option
 from lnocl.commands.parser import Command
 from lnocl.commands.signals import Terminated
@@ -254,7 +254,7 @@ def _write_log(folder: Folder, record: Record, log: str) -> None:
     )
 
 
-def _run(arguments: argparse.Namespace) -> None:
+def _run(arguments: argparse.Namespace) -> Iterator[str]:
     from lnocl.io import atomic
     from lnocl.parallel import check_parallel
     from lnocl.runs.progress import Progress
@@ -288,17 +288,13 @@ def _run(arguments: argparse.Namespace) -> None:
             bar.update(words=f"{record.name} {record.status}")
             write_where_due()
     summary = _summary(folder, targets, start)
-    if not arguments.quiet:
-        messages.say(_summarise(summary, n_old, folder))
+    yield from _summarise(summary, n_old, folder)
     if arguments.plot is not None:
         from lnocl.plotting.batch import draw_batch
 
         done = [name for name, status in summary.iterrows("name", "status") if status == DONE]
-        line = pictures.draw(
-            arguments, draw_batch({name: folder.file(name, ".fits") for name in done})
-        )
-        if not arguments.quiet:
-            messages.say([line])
+        drawn = draw_batch({name: folder.file(name, ".fits") for name in done})
+        yield pictures.draw(arguments, drawn)
     _explain_failures(summary, own)
 
 

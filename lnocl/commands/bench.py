@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Iterator
 
-from lnocl.commands import messages, options
+from lnocl.commands import options
 from lnocl.commands.declared import BACKGROUND, DEVICE, READ_NOISE
 from lnocl.commands.options import option
 from lnocl.commands.parser import Command
@@ -36,15 +37,11 @@ OPTIONS = [
         help="pixels along each side of the demo's scene (default: 256)",
     ),
     DEVICE,
-    option(
-        "-o", "--output", metavar="STEM", help="write the table to STEM.ecsv, a plot to STEM.png"
-    ),
-    options.OVERWRITE.but(help="replace these files"),
-    options.QUIET.but(help="show no progress"),
+    options.QUIET.but(dest="no_progress", help="show no progress"),
 ]
 
 
-def _run(arguments: argparse.Namespace) -> None:
+def _run(arguments: argparse.Namespace) -> Iterator[str]:
     from lnocl.io.calibration import Calibration
     from lnocl.io.frames import read_frames
     from lnocl.opencl import device
@@ -55,19 +52,17 @@ def _run(arguments: argparse.Namespace) -> None:
         raise InputError("images need their PSFs: give --psf")
     if images and size is not None:
         raise InputError("--size is of the demo's scene, and images are given; leave one out")
-    n_iter, accuracy, stem = arguments.n_iter, arguments.accuracy, arguments.output
-    bench.check(n_iter, accuracy, stem, arguments.overwrite)
+    n_iter, accuracy = arguments.n_iter, arguments.accuracy
+    bench.check(n_iter, accuracy)
     spec = device.spec_of(device.choose(arguments.device).device)
     if images:
         levels = arguments.background or [0.0], arguments.read_noise or [0.0]
         read = read_frames(images, psfs, Calibration(*levels))
         stars = options.star_places(arguments.stars, None, read.header, images[0])
-        case = bench.Case(read.observation, stars, [*images, *psfs])
+        case = bench.Case(read.observation, stars)
     else:
         case = bench.simulated_case(256 if size is None else size)
-    lines = bench.run(case, n_iter, accuracy, spec, stem, arguments.overwrite, not arguments.quiet)
-    for line in lines:
-        messages.say([line])
+    return bench.run(case, n_iter, accuracy, spec, not arguments.no_progress)
 
 
 COMMAND = Command(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from lnocl.commands import checkpoints, messages, options, pictures, record
@@ -56,13 +56,21 @@ def solve(
     # Each process that makes replicas or tiles takes a device of its own, unless one was named.
     parameters = _parameters({**given, "device": arguments.device})
     parameters["progress"] = not arguments.quiet
-    if arguments.tile is None and not frames.observation.psf_fields:
+    if not in_tiles(arguments, frames.observation):
         if arguments.parallel:
             raise InputError(
                 "`parallel` does nothing without tiles: give `tile` too, or leave it out"
             )
         return deconvolve(frames.observation, **parameters, callback=callback)
     return _solve_tiles(arguments, frames.observation, parameters)
+
+
+def in_tiles(arguments: argparse.Namespace, observation: Observation) -> bool:
+    """Return whether a run is tile by tile, as is asked for, or as PSFs that vary may be."""
+    from lnocl.tiles import for_the_whole
+
+    varies = bool(observation.psf_fields)
+    return arguments.tile is not None or (varies and for_the_whole(observation) is None)
 
 
 def _solve_tiles(
@@ -79,7 +87,7 @@ def _solve_tiles(
     )
 
 
-def _run(arguments: argparse.Namespace) -> None:
+def _run(arguments: argparse.Namespace) -> Iterator[str]:
     from lnocl.io import atomic
     from lnocl.parallel import check_parallel
 
@@ -88,7 +96,6 @@ def _run(arguments: argparse.Namespace) -> None:
     checkpoints.check(arguments)
     check_parallel(arguments.parallel)
     with (
-        messages.shown_log(arguments.quiet, COMMAND.flags()),
         messages.recorded_warnings(COMMAND.flags()) as warned,
         checkpoints.Interrupts() as interrupts,
     ):
@@ -105,8 +112,7 @@ def _run(arguments: argparse.Namespace) -> None:
             from lnocl.plotting.result import draw_result
 
             lines.append(pictures.draw(arguments, draw_result(view_of(result))))
-        if not arguments.quiet:
-            messages.say(lines)
+        yield from lines
     interrupts.explain(arguments, result)
 
 

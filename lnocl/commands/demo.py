@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import argparse
 import shlex
+from collections.abc import Iterator
 
-from lnocl.commands import deconvolve, messages, simulate
+from lnocl.commands import deconvolve, simulate
 from lnocl.commands.declared import DEVICE
 from lnocl.commands.options import option, output_folder
 from lnocl.commands.parser import Command, Parser
@@ -29,7 +30,7 @@ def _parse(command: Command, words: list[str]) -> argparse.Namespace:
     return parser.parse_args(words[2:])
 
 
-def _run(arguments: argparse.Namespace) -> None:
+def _run(arguments: argparse.Namespace) -> Iterator[str]:
     from lnocl.opencl import device, trial
     from lnocl.studies import demo
 
@@ -39,13 +40,12 @@ def _run(arguments: argparse.Namespace) -> None:
     words = ["lnocl", "simulate", demo.SCENE, "--size", str(arguments.size), "-o"]
     words += [arguments.output, *more]
     found = simulate.write(_parse(simulate.COMMAND, words))
-    messages.say([shlex.join(words)])
+    yield shlex.join(words)
     for each in demo.commands(arguments.output, found):
         words = [*each, *more, "--device", device.spec_of(chosen)]
-        messages.say([shlex.join(words)])
-        deconvolve.COMMAND.run(_parse(deconvolve.COMMAND, words))
-    for line in demo.compare(arguments.output, arguments.overwrite):
-        messages.say([line])
+        yield shlex.join(words)
+        yield from deconvolve.COMMAND.carry_out(_parse(deconvolve.COMMAND, words))
+    yield from demo.compare(arguments.output, arguments.overwrite)
 
 
 COMMAND = Command(

@@ -8,12 +8,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from lnocl.commands import messages, options, pictures
+from lnocl.commands import options, pictures
 from lnocl.commands.again import Again
 from lnocl.commands.declared import parameter
 from lnocl.commands.messages import MAX_LISTED
 from lnocl.commands.parser import Command
 from lnocl.errors import counted
+from lnocl.process import ignored_notes
 from lnocl.result import Result
 
 if TYPE_CHECKING:
@@ -36,14 +37,14 @@ OPTIONS = [
 ]
 
 
-def _run(arguments: argparse.Namespace) -> None:
+def _run(arguments: argparse.Namespace) -> list[str]:
     from lnocl.io.fitsadd import add_parts
 
     found, again = find(arguments, "detections")
     table, unit = in_unit(found.detections, again.frames), again.frames.unit
     parts = {"DETECTIONS": table, "SIGNAL": found.signal_to_noise}
     add_parts(again.saved, parts, cards(found, unit), unit)
-    finish(arguments, found, table, "detections", _told(found, table))
+    return finish(arguments, found, table, "detections", _told(found, table))
 
 
 def find(arguments: argparse.Namespace, content: str) -> tuple[Significance, Again]:
@@ -61,7 +62,9 @@ def find(arguments: argparse.Namespace, content: str) -> tuple[Significance, Aga
 
     check()  # before the result is read; then that nothing that it was made of is replaced
     again = Again.read(arguments.result, arguments.quiet, check)
-    return significance(again.outcome(), arguments.width, arguments.false_alarms), again
+    outcome = again.outcome()
+    with ignored_notes():
+        return significance(outcome, arguments.width, arguments.false_alarms), again
 
 
 def in_unit(table: QTable, frames: Frames) -> QTable:
@@ -97,8 +100,8 @@ def finish(
     content: str,
     lines: Sequence[str],
     curves: QTable | None = None,
-) -> None:
-    """Write the table and the picture where they are asked for; say the lines, and what was done.
+) -> list[str]:
+    """Write table and picture where they are asked for; return the lines, and what was done.
 
     The picture is that of limits where their curves are given.
     """
@@ -113,8 +116,7 @@ def finish(
         from lnocl.plotting.significance import draw_significance
 
         said.append(pictures.draw(arguments, draw_significance(found.view(curves))))
-    if not arguments.quiet:
-        messages.say(said)
+    return said
 
 
 def _told(found: Significance, table: QTable) -> list[str]:

@@ -3,50 +3,47 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Iterator
 
-from lnocl.commands import messages, options
+from lnocl.commands import options
 from lnocl.commands.declared import DEVICE
 from lnocl.commands.parser import Command
 
 
-def _run(arguments: argparse.Namespace) -> None:
+def _run(arguments: argparse.Namespace) -> Iterator[str]:
     import numpy as np
 
     from lnocl.opencl import device, trial
     from lnocl.opencl.tuning import describe_tuning
 
     if arguments.tune:
-        _tune(arguments.device)
+        yield from _tune(arguments.device)
         return
     found, single = device.find_devices(), np.dtype(np.float32)
     choice = device.choose(None)
-    messages.say(
-        f"{device.spec_of(each)} {device.describe(each)}; {describe_tuning(each, single)}"
-        for each in found
-    )
+    for each in found:
+        yield f"{device.spec_of(each)} {device.describe(each)}; {describe_tuning(each, single)}"
     trial.check(choice.device)
-    messages.say(
-        [f"lnocl uses {device.spec_of(choice.device)} unless told otherwise: {choice.reason}"]
-    )
+    yield f"lnocl uses {device.spec_of(choice.device)} unless told otherwise: {choice.reason}"
 
 
-def _tune(spec: str | None) -> None:
+def _tune(spec: str | None) -> Iterator[str]:
     from lnocl.opencl.device import choose, describe
     from lnocl.opencl.tuning import in_words, store
     from lnocl.studies import tuning
 
     device = choose(spec).device
-    messages.say([f"iterations on {describe(device)}; this takes up to a minute"])
+    yield f"iterations on {describe(device)}; this takes up to a minute"
     chosen = {}
     for dtype, timed in tuning.measure(spec):
         chosen[dtype] = tuning.fastest(timed)
-        rows = (
-            f"{dtype.name}, {in_words(each.tuning, dtype)}: {each.ms:.2f} ms, {each.ratio:.2f} of "
-            f"the first{'  <- taken from now on' if each.tuning == chosen[dtype] else ''}"
-            for each in timed
-        )
-        messages.say(rows)
-    messages.say([f"stored in {store(device, chosen)}"])
+        for each in timed:
+            taken = "  <- taken from now on" if each.tuning == chosen[dtype] else ""
+            yield (
+                f"{dtype.name}, {in_words(each.tuning, dtype)}: {each.ms:.2f} ms, "
+                f"{each.ratio:.2f} of the first{taken}"
+            )
+    yield f"stored in {store(device, chosen)}"
 
 
 COMMAND = Command(

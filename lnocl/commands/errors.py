@@ -3,20 +3,36 @@
 from __future__ import annotations
 
 import argparse
-from typing import TYPE_CHECKING
+import contextlib
+import dataclasses
+import re
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
 
-from lnocl.commands import bootstrap, messages, options
+import numpy as np
+
+from lnocl.commands import options
 from lnocl.commands.again import Again
 from lnocl.commands.declared import parameter
+from lnocl.commands.messages import MAX_LISTED
 from lnocl.commands.options import option
 from lnocl.commands.parser import Command
-from lnocl.errors import note
+from lnocl.commands.running import written_as_done
+from lnocl.errors import FileError, InputError, note
+from lnocl.process import ignored_notes
 from lnocl.result import Result
+from lnocl.scene.apertures import Aperture
 
 if TYPE_CHECKING:
-    from lnocl.io.frames import Frames
-    from lnocl.runs.bootstrap import Part
+    from astropy.table import QTable
 
+    from lnocl.io.fitserrors import Held
+    from lnocl.io.frames import Frames
+    from lnocl.runs.bootstrap import Bootstrap, Part
+    from lnocl.runs.outcome import Outcome
+
+# Names of quantities of stars and halos; others are of regions and profiles.
+_OF_STARS = re.compile(r"star \d+( epoch \d+)? (flux|x|y)|halo \d+ image \d+")
 OPTIONS = [
     options.result("its errors are added to it, after those of replicas that it has"),
     parameter(Result.bootstrap, "n", "--bootstrap"),
@@ -41,22 +57,20 @@ OPTIONS = [
 ]
 
 
-def _run(arguments: argparse.Namespace) -> None:
+def _run(arguments: argparse.Namespace) -> list[str]:
     from lnocl.parallel import check_parallel
     from lnocl.runs.bootstrap import check_number
 
     check_parallel(arguments.parallel)
     check_number(arguments.bootstrap, arguments.seed)
     again = Again.read(arguments.result, arguments.quiet)
-    with messages.shown_log(arguments.quiet, COMMAND.flags()):
-        parts = _parts(arguments, again.frames)
-        if not arguments.overwrite:  # before the run is made again, where it is
-            bootstrap.check_earlier(arguments.result, arguments.seed, parts)
+    parts = _parts(arguments, again.frames)
+    if not arguments.overwrite:
+        _check_seed(arguments.result, arguments.seed)
     outcome = again.outcome()
-    with messages.shown_log(arguments.quiet, name=messages.PROGRESS):
-        lines = bootstrap.add_errors(arguments, outcome, again, parts)
-    if not arguments.quiet:
-        messages.say([*lines, f"added to {arguments.result}"])
+    with ignored_notes():
+        lines = _add_errors(arguments, outcome, again, parts)
+    return [*lines, f"added to {arguments.result}"]
 
 
 def _parts(arguments: argparse.Namespace, frames: Frames) -> list[Part]:
@@ -72,6 +86,168 @@ def _parts(arguments: argparse.Namespace, frames: Frames) -> list[Part]:
             oversample,
         )
     return read_parts(*given, frames.header, frames.observation)
+
+
+def _add_errors(
+    arguments: argparse.Namespace,
+    outcome: Outcome,
+    again: Again,
+    parts: Sequence[Part],
+) -> list[str]:
+    """Add the errors of a result to its file, as replicas are done; return what to say of them.
+
+    Parameters
+    ----------
+    arguments : Namespace
+        Those of ``lnocl errors``.
+    outcome : Outcome
+        What the run has found.
+    again : Again
+        The file, and what its result was made of.
+    parts : list of Aperture or Profile
+        Regions and profiles that are measured.
+    """
+    from lnocl.io.fitserrors import read_replicas
+    from lnocl.runs.bootstrap import bootstrap, without_replicas
+
+    seed, frames = arguments.seed, again.frames
+    latest: list[Bootstrap] = []
+
+    def write() -> None:
+        for found in latest:
+            _write(again, found, parts, before)
+
+    expected = without_replicas(outcome, parts, seed)
+    before = earlier = None
+    if arguments.overwrite:
+        with contextlib.suppress(FileError):  # damaged ones
+            before = read_replicas(again.saved.path)
+    else:
+        earlier = _earlier(again.saved.path, expected, frames)
+    with written_as_done(write) as write_where_due:
+
+        def look(found: Bootstrap) -> None:
+            latest[:] = [found]
+            write_where_due()
+
+        n, is_shown = arguments.bootstrap, not arguments.quiet
+        found = bootstrap(outcome, n, parts, seed, is_shown, earlier, look, arguments.parallel)
+    return _summarise(found, parts, frames)
+
+
+def _check_seed(path: str, seed: int) -> None:
+    """Refuse replicas in a file of another seed, before a run is made again.
+
+    Raises
+    ------
+    FileError, InputError
+        As `read_replicas`; or there are such.
+    """
+    from lnocl.io.fitserrors import read_replicas
+
+    held = read_replicas(path)
+    if held is not None and held.seed != seed:
+        raise _of_others(path, held)
+
+
+def _of_others(path: str, held: Held) -> InputError:
+    names = dict.fromkeys(name for name in held.names if not _OF_STARS.fullmatch(name))
+    regions = f"the regions {', '.join([*names][:3])}" if names else "no regions"
+    return InputError(
+        f"{path} has replicas with `seed` {held.seed} of {regions}: give the same `regions`, "
+        "`profiles` and `seed`, or take `overwrite` to begin anew"
+    )
+
+
+def _earlier(path: str, expected: Bootstrap, frames: Frames) -> Bootstrap | None:
+    """Return the replicas that a file has; refuse those of something else."""
+    from lnocl.io.fitserrors import read_replicas
+
+    held = read_replicas(path)
+    if held is None:
+        return None
+    if not _held(expected, frames).is_start_of(held):
+        raise _of_others(path, held)
+    return dataclasses.replace(expected, errors=held.errors, of_psfs=held.of_psfs, sums=held.sums)
+
+
+def _held(found: Bootstrap, frames: Frames) -> Held:
+    from lnocl.io.fitserrors import Held
+
+    names = [each.name.strip() for each in found.quantities]
+    values = found.values / found.units(frames.electrons)
+    return Held(names, values, found.errors, found.of_psfs, found.sums, found.seed)
+
+
+def _write(again: Again, found: Bootstrap, parts: Sequence[Part], before: Held | None) -> None:
+    from lnocl.io.fitserrors import write_errors
+
+    frames = again.frames
+    quantities = found.to_table(frames.electrons, frames.unit)
+    quantities["name"] = [name.strip() for name in quantities["name"]]
+    measured = quantities[[each.at is None for each in found.quantities]]
+    write_errors(
+        again.saved,
+        quantities,
+        _held(found, frames),
+        {
+            "REGIONS": _table_of(_regions(parts), measured),
+            "ERROR": found.error_map / frames.electrons,
+            "BIAS": found.bias_map / frames.electrons,
+            "SHARE": found.share_map,
+        },
+        [
+            ("NREPL", found.n, "replicas"),
+            ("RESOLUT", found.resolution, "FWHM that maps are smoothed to, pixels"),
+        ],
+        frames.unit,
+        before,
+    )
+
+
+def _regions(parts: Sequence[Part]) -> list[Aperture]:
+    return [each for each in parts if isinstance(each, Aperture)]
+
+
+def _table_of(regions: Sequence[Aperture], measured: QTable) -> QTable:
+    """Return the regions, which are measured last, as a table: name, area, centre and flux."""
+    from astropy.table import QTable
+
+    columns: dict[str, list[Any]] = {name: [] for name in ("name", "pixels", "x", "y")}
+    for each in regions:
+        y, x = each.places
+        columns["name"].append(each.name)
+        columns["pixels"].append(each.n_pixels)
+        columns["x"].append((each.weights * x).sum() / each.n_pixels)
+        columns["y"].append((each.weights * y).sum() / each.n_pixels)
+    table = QTable(columns, dtype=(str, float, float, float))
+    of_regions = measured[len(measured) - len(regions) :]
+    table["flux"] = of_regions["value"] - of_regions["bias"]
+    for name in ("error", "share", "unit", "note"):
+        table[name] = of_regions[name]
+    return table
+
+
+def _summarise(found: Bootstrap, parts: Sequence[Part], frames: Frames) -> list[str]:
+    """Return a line a quantity, first those of regions, which were asked for."""
+    table = found.to_table(frames.electrons, frames.unit)
+    table = table[[each.at is None for each in found.quantities]]  # profiles are to be drawn
+    n_regions = len(_regions(parts))
+    table, n_listed = table[np.roll(np.arange(len(table)), n_regions)], max(MAX_LISTED, n_regions)
+    lines = [f"errors by {found.n} replicas, less their bias; in brackets 95 %:"]
+    for row in table[:n_listed]:
+        note = f"; {row['note']}: do not trust its error" if row["note"] else ""
+        if not _OF_STARS.fullmatch(row["name"]) and np.isfinite(row["share"]):
+            note = f"; there in {100 * row['share']:.0f} % of replicas{note}"
+        if len(found.of_psfs):
+            note += f"; noise {row['error_noise']:.2g}, PSF {row['error_psf']:.2g}"
+        lines.append(
+            f"{row['name']}: {row['value'] - row['bias']:.6g} +- {row['error']:.2g} "
+            f"{row['unit']} ({row['low95']:.6g} to {row['high95']:.6g}{note})"
+        )
+    if len(table) > n_listed:
+        lines.append(f"and {len(table) - n_listed} more in the table ERRORS")
+    return lines
 
 
 COMMAND = Command(

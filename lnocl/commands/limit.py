@@ -7,18 +7,19 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from lnocl.commands import detect, messages, options
+from lnocl.commands import detect, options
 from lnocl.commands.options import option
 from lnocl.commands.parser import Command
 from lnocl.errors import warn
+from lnocl.process import ignored_notes
 
 if TYPE_CHECKING:
     from astropy.table import QTable
 
     from lnocl.significance import Significance
 
-# Probabilities of being found; those at which sources are put in.
-COMPLETENESS, PUT_IN = (0.5, 0.9, 0.95), (0.5, 0.9)
+# Probabilities of being found at which sources are put in.
+PUT_IN = 0.5, 0.9
 # A share that is found is not the stated one where it is as rare as this.
 RARE = 1e-3
 
@@ -48,24 +49,23 @@ OPTIONS = [
 ]
 
 
-def _run(arguments: argparse.Namespace) -> None:
+def _run(arguments: argparse.Namespace) -> list[str]:
     from lnocl.io.fitsadd import add_parts
+    from lnocl.io.parts import COMPLETENESS
     from lnocl.significance import check_injections
 
     check_injections(arguments.injections or 1, arguments.seed)
     found, again = detect.find(arguments, "limits")
     frames = again.frames
-    curves = found.contrast_curves(COMPLETENESS)
+    curves = found.contrast_curves([each / 100 for each in COMPLETENESS])
     table = detect.in_unit(curves, frames)
-    maps = {
-        f"LIMIT{100 * share:g}": found.limit(share) / frames.electrons for share in COMPLETENESS
-    }
+    maps = {f"LIMIT{each}": found.limit(each / 100) / frames.electrons for each in COMPLETENESS}
     cards = detect.cards(found, frames.unit)
     add_parts(again.saved, {"LIMITS": table, **maps}, cards, frames.unit)
     lines = _told(found, table, maps["LIMIT50"], frames.unit)
-    with messages.shown_log(arguments.quiet, name=messages.PROGRESS):
+    with ignored_notes():
         lines += _checked(found, arguments)
-    detect.finish(arguments, found, table, "limits", lines, curves)
+    return detect.finish(arguments, found, table, "limits", lines, curves)
 
 
 def _told(found: Significance, table: QTable, limit: np.ndarray, unit: str) -> list[str]:

@@ -15,8 +15,6 @@ from lnocl.errors import LnoclWarning, with_names
 
 # Rows of a table that are printed, unless more were asked for.
 MAX_LISTED = 12
-# The logger of lines of progress.
-PROGRESS = "lnocl.progress"
 
 
 def replace_closed_streams() -> None:
@@ -30,21 +28,21 @@ def replace_closed_streams() -> None:
 
 
 def say(lines: Iterable[str]) -> None:
-    """Write lines to stdout; a reader that has left early is not an error."""
-    try:
-        for line in lines:
+    """Write lines to stdout as they come; a reader that has left early is not an error."""
+    for line in lines:
+        try:
             sys.stdout.write(_one_line(line, sys.stdout) + "\n")
-        sys.stdout.flush()
-    except OSError as error:
-        # The rest of the buffer would fail again when the interpreter ends.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        if not isinstance(error, BrokenPipeError):
-            raise
+            sys.stdout.flush()
+        except OSError as error:
+            # The rest of the buffer would fail again when the interpreter ends.
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            if not isinstance(error, BrokenPipeError):
+                raise
 
 
 def fail(message: str, exit_status: int) -> int:
     """Write an error to stderr, and return the exit status."""
-    _complain("error", message)
+    _note(f"error: {message}")
     return exit_status
 
 
@@ -74,7 +72,7 @@ def show_warning(
     line: str | None = None,
 ) -> None:
     """Write a warning to stderr, with `in_shell`, in place of `warnings.showwarning`."""
-    _complain("warning", in_shell(_message_of(message), flags))
+    _note(f"warning: {in_shell(_message_of(message), flags)}")
 
 
 def _message_of(warning: Warning | str) -> str:
@@ -99,31 +97,24 @@ def recorded_warnings(flags: Mapping[str, str]) -> Iterator[list[str]]:
 
 
 @contextlib.contextmanager
-def shown_log(
-    quiet: bool = False, flags: Mapping[str, str] | None = None, name: str = "lnocl"
-) -> Iterator[None]:
+def shown_log(quiet: bool, flags: Mapping[str, str]) -> Iterator[None]:
     """Show the notes that the library logs on stderr, with `in_shell`, unless it is quiet.
 
-    Progress is shown where other notes are left out; a name of `PROGRESS` shows nothing else.
+    Inside that of another command it takes its place.
     """
-    if quiet:
-        yield
-        return
-    handler = _Notes(flags or {})
-    levels = {log: log.level for log in map(logging.getLogger, (name, PROGRESS))}
-    logging.getLogger(name).addHandler(handler)
-    for log in levels:
-        log.setLevel(logging.INFO)
+    log = logging.getLogger("lnocl")
+    handlers, levels = log.handlers, {each: each.level for each in (log, log.getChild("progress"))}
+    log.handlers = [each for each in handlers if not isinstance(each, _Notes)]
+    if not quiet:
+        log.addHandler(_Notes(flags))
+        for each in levels:
+            each.setLevel(logging.INFO)
     try:
         yield
     finally:
-        for log, level in levels.items():
-            log.setLevel(level)
-        logging.getLogger(name).removeHandler(handler)
-
-
-def _complain(kind: str, message: str) -> None:
-    _note(f"{kind}: {message}")
+        log.handlers = handlers
+        for each, level in levels.items():
+            each.setLevel(level)
 
 
 def _note(message: str) -> None:

@@ -5,11 +5,11 @@ from __future__ import annotations
 import argparse
 import os
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any, NamedTuple, NoReturn
 
-from lnocl.commands.messages import in_shell
-from lnocl.commands.options import Options
+from lnocl.commands.messages import in_shell, shown_log
+from lnocl.commands.options import Option, Options
 from lnocl.errors import InputError
 from lnocl.io.names import file_of
 
@@ -24,21 +24,31 @@ class Command(NamedTuple):
     options : Options
         Its arguments, by the headings of its help; those under no heading have an empty one.
     run : callable
-        Runs it with the parsed arguments.
+        Runs it with the parsed arguments, and yields the lines that it says.
     epilog : str
         The last paragraph of its help.
     """
 
     summary: str
     options: Options
-    run: Callable[[argparse.Namespace], None]
+    run: Callable[[argparse.Namespace], Iterable[str]]
     epilog: str = ""
+
+    def carry_out(self, arguments: argparse.Namespace) -> Iterator[str]:
+        """Run it, and yield the lines that it says, and show notes, unless it is to be quiet.
+
+        One that cannot be told to be quiet shows no notes.
+        """
+        with shown_log(getattr(arguments, "quiet", True), self.flags()):
+            for line in self.run(arguments):
+                if not getattr(arguments, "quiet", False):
+                    yield line
 
     def add_arguments(self, parser: argparse.ArgumentParser) -> None:
         """Add its options to its parser."""
         parser.epilog = self.epilog
-        needed = (each for options in self.options.values() for each in options if each.is_needed)
-        parser.usage = " ".join(["%(prog)s", *(each.usage() for each in needed), "[options]"])
+        needed = [each.usage() for each in self.all_options() if each.is_needed]
+        parser.usage = " ".join(["%(prog)s", *needed, "[options]"])
         flags = self.flags()
         for heading, options in self.options.items():
             group = parser.add_argument_group(heading) if heading else parser
@@ -54,23 +64,22 @@ class Command(NamedTuple):
         InputError
             There is one.
         """
-        for options in self.options.values():
-            for each in options:
-                each.refuse_ignored(vars(arguments))
+        for each in self.all_options():
+            each.refuse_ignored(vars(arguments))
 
     def inputs(self, arguments: argparse.Namespace) -> list[str]:
         """Return the names in its arguments that may be those of files to read."""
         values = vars(arguments)
-        return [
-            file_of(path)
-            for options in self.options.values()
-            for each in options
-            for path in each.inputs(values[each.name])
-        ]
+        found = (path for each in self.all_options() for path in each.inputs(values[each.name]))
+        return [*map(file_of, found)]
+
+    def all_options(self) -> list[Option]:
+        """Return its arguments, whatever their headings."""
+        return [each for group in self.options.values() for each in group]
 
     def flags(self) -> dict[str, str]:
         """Return the flag of each parameter that an option, or a kind of its values, stands for."""
-        options = [each for group in self.options.values() for each in group]
+        options = self.all_options()
         kinds = {
             parameter: f"{each.flags[-1]} {kind}"
             for each in options

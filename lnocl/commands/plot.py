@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Iterator
 
-from lnocl.commands import messages
 from lnocl.commands.options import option, output_folder
 from lnocl.commands.parser import Command
 
@@ -21,11 +21,10 @@ OPTIONS = [
 ]
 
 
-def _run(arguments: argparse.Namespace) -> None:
+def _run(arguments: argparse.Namespace) -> Iterator[str]:
     from lnocl.studies import figures
 
-    for line in figures.draw(arguments.output, arguments.results, arguments.overwrite):
-        messages.say([line])
+    return figures.draw(arguments.output, arguments.results, arguments.overwrite)
 
 
 COMMAND = Command(

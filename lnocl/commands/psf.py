@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lnocl.commands import messages, options, pictures, record
+from lnocl.commands import options, pictures, record
 from lnocl.commands.declared import SATURATION
 from lnocl.commands.options import number_or_word, option
 from lnocl.commands.parser import Command
@@ -117,13 +117,11 @@ OPTIONS = [
 ]
 
 
-def _run(arguments: argparse.Namespace) -> None:
+def _run(arguments: argparse.Namespace) -> list[str]:
     if arguments.check:
-        _report(arguments)
-        return
+        return _report(arguments)
     if arguments.modes is not None:
-        _make_modes(arguments)
-        return
+        return _make_modes(arguments)
     _check_outputs(arguments)
 
     from lnocl import psf
@@ -132,15 +130,14 @@ def _run(arguments: argparse.Namespace) -> None:
 
     sha256: dict[str, list[str]] = {}
     mask = None
-    with messages.shown_log(arguments.quiet):
-        stack = fitsread.read_single(arguments.frames[0])
-        frame, sha256["frames"], background = stack.data[0], stack.sha256, arguments.background
-        positions = _positions(arguments, stack.header)
-        if arguments.mask is not None:
-            mask, sha256["mask"] = mask_of(arguments.frames[0], arguments.mask)
-        if len(arguments.frames) > 1:
-            frame, positions, sha256["frames"] = _joined(arguments)
-            background = 0.0
+    stack = fitsread.read_single(arguments.frames[0])
+    frame, sha256["frames"], background = stack.data[0], stack.sha256, arguments.background
+    positions = _positions(arguments, stack.header)
+    if arguments.mask is not None:
+        mask, sha256["mask"] = mask_of(arguments.frames[0], arguments.mask)
+    if len(arguments.frames) > 1:
+        frame, positions, sha256["frames"] = _joined(arguments)
+        background = 0.0
     stars = psf.make_psfs(
         frame,
         arguments.rotate,
@@ -165,8 +162,7 @@ def _run(arguments: argparse.Namespace) -> None:
     )
     if arguments.plot is not None:
         lines.append(pictures.draw(arguments, _figure(arguments, stars)))
-    if not arguments.quiet:
-        messages.say(lines)
+    return lines
 
 
 def _parameters(arguments: argparse.Namespace) -> dict[str, Any]:
@@ -220,7 +216,7 @@ def _joined(
     return *effective.join(frames, bad), [sha for stack in stacks for sha in stack.sha256]
 
 
-def _make_modes(arguments: argparse.Namespace) -> None:
+def _make_modes(arguments: argparse.Namespace) -> list[str]:
     """Make the mean of the PSFs of several frames, and say how they differ."""
     _check_outputs(arguments)
     if arguments.plot is not None or len(arguments.rotate) > 1 or arguments.mask is not None:
@@ -231,9 +227,8 @@ def _make_modes(arguments: argparse.Namespace) -> None:
     from lnocl import psf
     from lnocl.io import fitsread
 
-    with messages.shown_log(arguments.quiet):
-        stack = fitsread.read_stack(arguments.frames)
-        positions = _positions(arguments, stack.header)
+    stack = fitsread.read_stack(arguments.frames)
+    positions = _positions(arguments, stack.header)
     stars = [
         psf.make_psf(
             frame,
@@ -266,8 +261,7 @@ def _make_modes(arguments: argparse.Namespace) -> None:
     lines.append(
         f"written to {arguments.output}: the mean of {len(stars)} PSFs of {k} x {k} pixels"
     )
-    if not arguments.quiet:
-        messages.say(lines)
+    return lines
 
 
 def _positions(
@@ -292,17 +286,16 @@ def _check_outputs(arguments: argparse.Namespace) -> None:
     pictures.check(arguments)
 
 
-def _report(arguments: argparse.Namespace) -> None:
+def _report(arguments: argparse.Namespace) -> list[str]:
     """Say how each PSF of a file looks by itself, and what speaks against it."""
     from lnocl.io import fitsread, sky
     from lnocl.psf.report import examine
 
     for each in OPTIONS:
         is_given = each.words(vars(arguments)[each.name]) != each.words(each.default)
-        if each.name not in ("frames", "check", "quiet") and is_given:
+        if each.name not in ("frames", "check") and is_given:
             raise InputError(f"--check makes nothing; leave {each.flags[0]} out")
-    with messages.shown_log(arguments.quiet):
-        stack = fitsread.read_stack(arguments.frames)
+    stack = fitsread.read_stack(arguments.frames)
     scale, finer = sky.pixel_scale(stack.headers[0]), sky.oversampling(stack.headers[0])
     lines = [f"pixels: {scale:.4g} arcsec, by its header"] if scale else []
     if finer:
@@ -310,7 +303,7 @@ def _report(arguments: argparse.Namespace) -> None:
     for j, report in enumerate(map(examine, stack.data), 1):
         lines += [f"PSF {j} of {len(stack.data)}:"] * (len(stack.data) > 1)
         lines += [*report.lines(), *(report.faults() or ["nothing speaks against it by itself"])]
-    messages.say(lines)
+    return lines
 
 
 def _squeezed(images: Sequence[NDArray[np.float64]]) -> NDArray[np.float64]:

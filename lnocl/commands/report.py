@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Iterator
 
-from lnocl.commands import messages, options
+from lnocl.commands import options
 from lnocl.commands.options import option
 from lnocl.commands.parser import Command
 from lnocl.errors import InputError
@@ -21,7 +22,7 @@ OPTIONS = [
 ]
 
 
-def _run(arguments: argparse.Namespace) -> None:
+def _run(arguments: argparse.Namespace) -> Iterator[str]:
     from lnocl.io import atomic
     from lnocl.studies import figures
 
@@ -32,7 +33,7 @@ def _run(arguments: argparse.Namespace) -> None:
     atomic.check_output(arguments.output, arguments.overwrite)
     page = figures.report(arguments.result)
     atomic.write_text(arguments.output, page, arguments.overwrite)
-    messages.say([f"written to {arguments.output}: open it in a browser"])
+    yield f"written to {arguments.output}: open it in a browser"
 
 
 COMMAND = Command(

@@ -41,7 +41,7 @@ def run(commands: Mapping[str, Command], words: Sequence[str]) -> int:
             flags |= parsed.command.flags()
             parsed.command.refuse_ignored(parsed)
             with kept(parsed.command.inputs(parsed)):
-                parsed.command.run(parsed)
+                messages.say(parsed.command.carry_out(parsed))
     except LnoclError as error:
         return messages.fail(messages.in_shell(error.message, flags), error.exit_status)
     except (MemoryError, RuntimeError) as error:

@@ -3,25 +3,25 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Iterator
 
 from lnocl import __version__
-from lnocl.commands import messages
 from lnocl.commands.declared import DEVICE
 from lnocl.commands.parser import Command
 
 
-def _run(arguments: argparse.Namespace) -> None:
+def _run(arguments: argparse.Namespace) -> Iterator[str]:
     from lnocl.opencl import device, trial
     from lnocl.studies import selftest
 
     chosen = device.choose(arguments.device).device
     trial.check(chosen)
     name, rows = device.describe(chosen), []
-    messages.say([f"lnocl {__version__} on {name}, {chosen.version}; this takes up to a minute"])
+    yield f"lnocl {__version__} on {name}, {chosen.version}; this takes up to a minute"
     for row in selftest.run(device.spec_of(chosen)):
-        messages.say([selftest.line(row)])
+        yield selftest.line(row)
         rows.append(row)
-    messages.say([selftest.verdict(rows, name)])
+    yield selftest.verdict(rows, name)
 
 
 COMMAND = Command(

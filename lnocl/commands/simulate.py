@@ -6,7 +6,7 @@ import argparse
 import os
 import shlex
 
-from lnocl.commands import messages, options
+from lnocl.commands import options
 from lnocl.commands.options import option, output_folder
 from lnocl.commands.parser import Command
 
@@ -72,8 +72,7 @@ def write(arguments: argparse.Namespace) -> list[str]:
     from lnocl.studies.files import names_of, write_simulation
 
     stars = arguments.stars and [Star(x, y, mag * u.mag) for x, y, mag in arguments.stars]
-    with messages.shown_log(arguments.quiet):
-        target = load_target(arguments.scene, arguments.size, stars)
+    target = load_target(arguments.scene, arguments.size, stars)
     units = {"angles": u.deg, "extended_magnitude": u.mag, "exposure_time": 1, "seed": 1}
     given = {name: getattr(arguments, name) for name in units}
     experiment = Experiment(
@@ -87,17 +86,10 @@ def write(arguments: argparse.Namespace) -> list[str]:
     return write_simulation(arguments.output, arguments.scene, simulation, arguments.overwrite)
 
 
-def _run(arguments: argparse.Namespace) -> None:
+def _run(arguments: argparse.Namespace) -> list[str]:
     words = write(arguments)
-    if arguments.quiet:
-        return
-    messages.say(
-        [
-            f"images, PSFs, truth.fits and record.json written to {arguments.output}; to "
-            "deconvolve them run",
-            shlex.join(words),
-        ]
-    )
+    written = f"images, PSFs, truth.fits and record.json written to {arguments.output}"
+    return [f"{written}; to deconvolve them run", shlex.join(words)]
 
 
 COMMAND = Command(

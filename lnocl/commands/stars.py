@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from lnocl.commands import messages, options, pictures
+from lnocl.commands import options, pictures
 from lnocl.commands.declared import SATURATION
 from lnocl.commands.options import option
 from lnocl.commands.parser import Command
@@ -50,25 +50,18 @@ OPTIONS = [
 ]
 
 
-def _run(arguments: argparse.Namespace) -> None:
+def _run(arguments: argparse.Namespace) -> list[str]:
     from lnocl.detection import find_stars
     from lnocl.io import atomic, fitsread, sky, tables
 
     tables.format_of(arguments.output, "stars")
     atomic.check_output(arguments.output, arguments.overwrite)
     pictures.check(arguments)
-    with messages.shown_log(arguments.quiet, COMMAND.flags()):
-        stack = fitsread.read_single(arguments.image)
-        image = stack.data[0]
-        psf = None if arguments.psf is None else fitsread.read_single(arguments.psf).data[0]
-        mask = _mask(arguments)
-        stars = find_stars(
-            image,
-            psf,
-            threshold=arguments.threshold,
-            mask=mask,
-            saturation=arguments.saturation,
-        )
+    stack = fitsread.read_single(arguments.image)
+    image = stack.data[0]
+    psf = None if arguments.psf is None else fitsread.read_single(arguments.psf).data[0]
+    mask, level = _mask(arguments), arguments.saturation
+    stars = find_stars(image, psf, threshold=arguments.threshold, mask=mask, saturation=level)
     stars.add_column(np.arange(1, len(stars) + 1), name="star", index=0)
     if len(stars) and sky.has_celestial(stack.header):
         positions = np.array([stars["x"], stars["y"]]).T
@@ -86,8 +79,7 @@ def _run(arguments: argparse.Namespace) -> None:
         from lnocl.plotting.stars import draw_stars
 
         lines.append(pictures.draw(arguments, draw_stars(image, stars)))
-    if not arguments.quiet:
-        messages.say(lines)
+    return lines
 
 
 def _mask(arguments: argparse.Namespace) -> Mask | None:

@@ -94,7 +94,8 @@ class ReferenceEngine:
         skies = self._row_spectrum
         if (transmission := self.scene.transmission) is not None:
             skies = transmit_rows(self._extended, transmission)
-        row_spectra = convolve_columns(skies, self._otfs, self.scene.oversample, self._phases)
+        step = self.scene.oversample if self._phases is None else 1
+        row_spectra = convolve_columns(skies, self._otfs, step, self._phases)
         observed = (
             self._images,
             self.scene.weights,

@@ -26,6 +26,7 @@ from lnocl.opencl.tuning import Tuning, describe_tuning
 from lnocl.opencl.turned import TurnedImages
 from lnocl.opencl.windows import StarWindows
 from lnocl.scene.arrays import Array
+from lnocl.scene.camera import spread
 from lnocl.scene.scene import MIN_MODEL, Scene
 from lnocl.scene.stars import covered_box
 from lnocl.solvers.engine import State
@@ -37,6 +38,8 @@ ITERATIONS_AHEAD = 4
 # And looks at the objectives once in so many, at those of as many before: a transfer costs the host
 # as much as launching an iteration.
 FETCH_EVERY = 64
+# What the images hold where a pixel was not observed.
+UNSEEN = -1.0
 # Share of the objective that single precision may round a step's fall by: 8e-7 and less were seen.
 ROUNDING = 3e-7
 
@@ -95,7 +98,7 @@ class OpenCLEngine:
             scene.grid,
             np.dtype(np.float64 if precision == "double" else np.float32),
             tuning,
-            oversample=scene.oversample,
+            oversample=1 if scene.rotations else scene.oversample,
             has_mu=scene.mu > 0,
             has_smoothing=scene.is_smoothed,
             has_smoothing_map=scene.smoothing_map is not None,
@@ -114,6 +117,7 @@ class OpenCLEngine:
             scene.n_images,
             self._turned.rolls if self._turned else [],
             scene.shown,
+            self._spacing,
         )
         self._cross = self._cross_windows()
         sizes = buffer_sizes(scene, self.program, self.layout, self._stars, n_iter)
@@ -150,6 +154,11 @@ class OpenCLEngine:
         return TurnedImages(rotations, self.program, self.layout) if rotations else None
 
     @property
+    def _spacing(self) -> int:
+        """Pixels of an image here to one of the scene's: turned images lie on pixels of the sky."""
+        return self.program.image_grid[0] // self.scene.image_grid[0]
+
+    @property
     def is_proven(self) -> bool:
         """Whether every kernel of an iteration has been launched."""
         return self._n_objectives > self._n_restored + 1
@@ -157,7 +166,8 @@ class OpenCLEngine:
     @property
     def _observed_blocks(self) -> int:
         """Blocks of row pairs of the images' grid that hold rows of the images."""
-        return -(-self.scene.observation.shape[0] // (2 * self.program.tuning.block))
+        rows = self._spacing * self.scene.observation.shape[0]
+        return -(-rows // (2 * self.program.tuning.block))
 
     def _cross_windows(self) -> StarWindows:
         cutouts = self.scaling.cross_information if self.scaling is not None else []
@@ -209,10 +219,10 @@ class OpenCLEngine:
         memory.clear("star_sums")  # in images that do not show a star they stay 0
         self.take_images()
         if scene.weights is not None and scene.has_exposure_map:
-            memory.upload_pixels("exposure", self._laid(scene.weights))
+            memory.upload_pixels("exposure", self._laid(scene.weights, 0.0))
         background = scene.background()
         if background.ndim == 3:
-            memory.upload_pixels("background", self._laid(background))
+            memory.upload_pixels("background", self._laid(background, 1.0))
         else:
             memory.upload("background", background)
         if scene.smoothing_map is not None:
@@ -226,13 +236,15 @@ class OpenCLEngine:
         if scene.weights is not None:
             self._invert(self._total_weight(scene.weights))
 
-    def _laid(self, images: Iterable[Array]) -> Iterable[Array]:
-        """Return images as they lie on the device."""
-        return self._turned.laid(images) if self._turned else images
+    def _laid(self, images: Iterable[Array], beside: float) -> Iterable[Array]:
+        """Return images as they lie on the device, with a value beside their pixels."""
+        laid = (spread(image, self._spacing, beside) for image in images)
+        return self._turned.laid(laid) if self._turned else laid
 
     def take_images(self) -> None:
         """Take the images that the scene has now, all else being as it was; forget the record."""
-        self._memory.upload_pixels("images", self._laid(self._marked_images()))
+        beside = 0.0 if self.scene.has_exposure_map else UNSEEN
+        self._memory.upload_pixels("images", self._laid(self._marked_images(), beside))
         self._forget_record()
 
     def _forget_record(self) -> None:
@@ -244,11 +256,11 @@ class OpenCLEngine:
         self._fetched: list[float] = []
 
     def _marked_images(self) -> Iterator[Array]:
-        """Yield the images; unobserved pixels are -1, unless a map of exposures marks them."""
+        """Yield the images; `UNSEEN` is not observed, unless a map of exposures marks that."""
         weights = None if self.scene.has_exposure_map else self.scene.weights
         for j, image in enumerate(self.scene.images()):
             if weights is not None:
-                image[~weights[j]] = -1.0
+                image[~weights[j]] = UNSEEN
             yield image
 
     def set_scaling(self, scaling: Scaling) -> None:

@@ -8,7 +8,7 @@ import numpy as np
 
 from lnocl.errors import counted, note, warn
 from lnocl.io.calibration import Calibration
-from lnocl.io.fitsread import read_keyword
+from lnocl.io.fitsread import read_contents
 from lnocl.io.flags import NO_BITS, bad_pixels, good_bits_of, most_common_flag
 from lnocl.io.image_files import ImageFiles
 from lnocl.scene.arrays import Array, Mask
@@ -77,13 +77,10 @@ def _bad_pixels(files: ImageFiles, exposure: Array | None) -> Iterator[tuple[str
 def _data_quality(files: ImageFiles, word: str) -> Mask:
     sums = files.extensions("DQ", "mask")
     flagged = np.empty(sums.shape, bool)
-    for j, header in enumerate(files.stack.headers):
-        path, good_bits = files.paths[j], word[len("dq:") :]
+    for j, path in enumerate(files.paths):
+        good_bits = word[len("dq:") :]
         if word == "dq":
-            words = (
-                str(read_keyword(path, header, keyword) or "").strip()
-                for keyword in ("TELESCOP", "INSTRUME", "DETECTOR")
-            )
+            words = map(read_contents(path).value, ("TELESCOP", "INSTRUME", "DETECTOR"))
             good_bits = good_bits_of(*words)
         if good_bits != NO_BITS:
             note("%s: of the flags in DQ %s are no fault", path, good_bits)

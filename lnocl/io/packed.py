@@ -21,8 +21,6 @@ from lnocl.process import ignored_warnings
 BLOCK, PART = 2880, 2**20
 # Bytes of the longest header, and of what is unpacked in memory.
 MAX_HEADER, IN_MEMORY = 2**23, 2**25
-# Bytes after the last HDU up to which a file is unpacked to its checksum at the end.
-TAIL = 2**20
 # What unpacks files, by the bytes that they begin with.
 UNPACK: dict[bytes, Callable[[Any], Any]] = {
     b"\x1f\x8b\x08": gzip.open,
@@ -87,7 +85,7 @@ def _copy(path: str, content: IO[bytes], copy: IO[bytes]) -> None:
             )
         if copy_bytes(content, copy, header.data_size + -header.data_size % BLOCK):
             break
-    content.read(TAIL)
+    content.read(PART)  # up to the checksum at the end
 
 
 def _has_room(size: int) -> bool:

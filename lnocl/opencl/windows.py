@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from lnocl.opencl.layout import PixelLayout, shortest_arc
 from lnocl.scene.arrays import Array
+from lnocl.scene.camera import spread
 from lnocl.scene.shifting import Cutout
 from lnocl.scene.stars import Covered
 
@@ -72,6 +73,8 @@ class StarWindows:
         For each array the columns by which its rows are rotated.
     shown : ndarray of bool, shape (n, n_arrays), optional
         Which arrays hold each star; by default all. With it sums over other blocks are not written.
+    step : int, optional
+        Each pixel of boxes and cutouts is the first of so many of the layout, along each axis.
     """
 
     def __init__(
@@ -81,11 +84,13 @@ class StarWindows:
         n_arrays: int,
         rolls: Sequence[NDArray[np.int_]] = (),
         shown: NDArray[np.bool_] | None = None,
+        step: int = 1,
     ) -> None:
-        self._layout, self._rolls = layout, rolls
-        blocks, columns = [], []
+        self._layout, self._rolls, self._step = layout, rolls, step
+        blocks, columns, first = [], [], np.arange(step) == 0
         for of_star in boxes:
-            for a, box in enumerate(of_star):
+            for a, coarse in enumerate(of_star):
+                box = Covered(*(np.kron(each, first) for each in coarse))
                 blocks.append(layout.window(box.rows))
                 columns.append(_rolled_arc(box, rolls[a]) if rolls else shortest_arc(box.columns))
         self.corners = np.array(
@@ -116,7 +121,8 @@ class StarWindows:
 
     def cut(self, s: int, a: int, cutout: Cutout) -> Array:
         """Return the pixels of a window of a star, with a cutout in them."""
-        block, column = self.corners[s, a].tolist()
+        q, (block, column) = self._step, self.corners[s, a].tolist()
+        cutout = Cutout(spread(cutout.values, q), q * cutout.y, q * cutout.x)
         rows = self._layout.rows_of(block, self.n_blocks)
         if not self._rolls:
             window = np.zeros((rows.size, self.n_columns))

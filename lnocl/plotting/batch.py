@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from lnocl.io.saved_results import read_result
-from lnocl.plotting.figure import COLOUR_MAP, as_text, new_figure
+from lnocl.plotting.figure import as_text, extent_of, new_figure, show_image
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -52,9 +52,7 @@ def draw_batch(results: Mapping[str, str]) -> Figure:
         step = max(math.ceil(max(ny, nx) / SIDE), 1)
         top = max(float(np.quantile(saved.extended, 1.0 - BRIGHTEST)), np.finfo(float).tiny)
         norm = AsinhNorm(linear_width=top / 30.0, vmin=0.0, vmax=top)
-        extent = (-0.5, nx - 0.5, -0.5, ny - 0.5)
-        shown = saved.extended[::step, ::step]
-        each.imshow(shown, origin="lower", cmap=COLOUR_MAP, norm=norm, extent=extent)
+        show_image(each, saved.extended[::step, ::step], norm, extent_of((ny, nx)))
         for x, y in saved.sky_stars:
             each.plot(x, y, "+", color="white", markersize=4)
         each.set_title(as_text(name), fontsize=6, pad=2)

@@ -3,13 +3,19 @@
 from __future__ import annotations
 
 import io
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
+
+from numpy.typing import NDArray
 
 from lnocl.errors import LnoclError
 from lnocl.io.atomic import whole_file
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.colors import Normalize
     from matplotlib.figure import Figure
+    from matplotlib.image import AxesImage
 
 
 DPI = 110
@@ -17,6 +23,8 @@ DPI = 110
 COLOURS = ("#D55E00", "#0072B2", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 STYLES = ("-", "--", "-.", ":")
 COLOUR_MAP = "viridis"
+# Stars that are drawn by themselves, the brightest or first; and sources that are numbered.
+MOST_STARS, MOST_NUMBERED = 6, 40
 
 
 def check_matplotlib() -> None:
@@ -53,7 +61,14 @@ def save_figure(figure: Figure, path: str, overwrite: bool = False) -> None:
         The file cannot be written, or exists and must not be overwritten.
     """
     with whole_file(path, overwrite) as stream:
+        stream.write(png_of(figure))
+
+
+def png_of(figure: Figure) -> bytes:
+    """Return a figure as PNG."""
+    with io.BytesIO() as stream:
         figure.savefig(stream, format="png", dpi=DPI, pil_kwargs={"optimize": True})
+        return stream.getvalue()
 
 
 def new_figure(width: float, height: float) -> Figure:
@@ -67,13 +82,38 @@ def new_figure(width: float, height: float) -> Figure:
 
     class ShownFigure(Figure):
         def _repr_png_(self) -> bytes:
-            with io.BytesIO() as stream:
-                self.savefig(stream, format="png", dpi=DPI)
-                return stream.getvalue()
+            return png_of(self)
 
     figure = ShownFigure(figsize=(width, height), layout="constrained")
     FigureCanvasAgg(figure)
     return figure
+
+
+def show_image(
+    axis: Axes,
+    image: NDArray[Any],
+    norm: Normalize,
+    extent: tuple[float, float, float, float] | None = None,
+    colours: str = COLOUR_MAP,
+    bad: str = "0.6",
+) -> AxesImage:
+    """Draw an image with y upwards and its pixels as they are, NaN in a colour of its own."""
+    from matplotlib import colormaps
+
+    return axis.imshow(
+        image,
+        norm=norm,
+        cmap=colormaps[colours].with_extremes(bad=bad),
+        origin="lower",
+        interpolation="nearest",
+        extent=extent,
+    )
+
+
+def extent_of(shape: Sequence[int], finer: int = 1) -> tuple[float, float, float, float]:
+    """Return the edges of an image whose pixels are so many times finer than the axes'."""
+    ny, nx = (n / finer for n in shape)
+    return -0.5, nx - 0.5, -0.5, ny - 0.5
 
 
 def line_style(i: int) -> dict[str, Any]:

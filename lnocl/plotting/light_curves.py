@@ -9,11 +9,8 @@ import numpy as np
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-from lnocl.plotting.figure import as_text, line_style
+from lnocl.plotting.figure import MOST_STARS, as_text, line_style
 from lnocl.scene.arrays import Array
-
-# Stars that are drawn, the brightest.
-MOST = 6
 
 
 class LightCurves(NamedTuple):
@@ -46,7 +43,7 @@ def draw(axis: Axes, curves: LightCurves) -> None:
 
     is_seen = np.isfinite(curves.fluxes)
     means = np.where(is_seen, curves.fluxes, 0.0).sum(axis=1) / np.maximum(is_seen.sum(axis=1), 1)
-    shown = np.sort(np.argsort(-means, kind="stable")[:MOST])
+    shown = np.sort(np.argsort(-means, kind="stable")[:MOST_STARS])
     epochs = np.arange(curves.fluxes.shape[1])
     for i, s in enumerate(shown[means[shown] > 0]):
         flux, error = curves.fluxes[s] / means[s], curves.errors[s] / means[s]

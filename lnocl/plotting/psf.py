@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-from lnocl.plotting.figure import COLOUR_MAP, COLOURS, line_style, new_figure
+from lnocl.plotting.figure import COLOURS, line_style, new_figure, show_image
 from lnocl.scene.arrays import Array
 
 # Share of a PSF's peak at which its stretch ends.
@@ -118,15 +118,7 @@ def _draw_log(
     axis: Axes, image: Array, extent: tuple[float, float, float, float], top: float
 ) -> Any:
     """Draw an image in logarithmic stretch, negative pixels in the darkest colour."""
-    from matplotlib import colormaps
     from matplotlib.colors import LogNorm
 
-    colours = colormaps[COLOUR_MAP].with_extremes(bad=COLOURS[0])
-    return axis.imshow(
-        (image / top).clip(PSF_FLOOR),
-        norm=LogNorm(PSF_FLOOR, 1),
-        cmap=colours,
-        origin="lower",
-        interpolation="nearest",
-        extent=extent,
-    )
+    shown = (image / top).clip(PSF_FLOOR)
+    return show_image(axis, shown, LogNorm(PSF_FLOOR, 1), extent, bad=COLOURS[0])

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lnocl.notebook import block_means
-from lnocl.plotting.figure import COLOUR_MAP, DPI, new_figure
+from lnocl.plotting.figure import COLOUR_MAP, new_figure, png_of
 from lnocl.plotting.result import (
     FAINT_SHARE,
     MAX_SIGMA,
@@ -210,9 +210,7 @@ def _curve(view: ResultView) -> str:
 
 
 def _picture(figure: Figure) -> str:
-    with io.BytesIO() as stream:
-        figure.savefig(stream, format="png", dpi=DPI, pil_kwargs={"optimize": True})
-        return base64.b64encode(stream.getvalue()).decode("ascii")
+    return base64.b64encode(png_of(figure)).decode("ascii")
 
 
 def _list(lines: Sequence[str]) -> str:

@@ -14,21 +14,22 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 from lnocl.plotting import light_curves
-from lnocl.plotting.figure import COLOUR_MAP, as_text, line_style, new_figure
+from lnocl.plotting.figure import (
+    COLOUR_MAP,
+    MOST_NUMBERED,
+    MOST_STARS,
+    as_text,
+    line_style,
+    new_figure,
+    show_image,
+)
 from lnocl.plotting.light_curves import LightCurves
 from lnocl.scene.arrays import Array
 
-# Stars that are shown enlarged, the brightest; more are not numbered from as many on.
-MAX_ZOOMS, MAX_NUMBERS = 6, 40
-# Half the side of an enlarged region: pixels, and share of the longer side of the frame.
-ZOOM, ZOOM_SHARE = 16, 1 / 16
 # Residuals are shown between these, in standard deviations of the noise.
 MAX_SIGMA = 5.0
 # An extended source is shown down to this share of its brightest pixel, nearly logarithmically.
 FAINT_SHARE = 3e-3
-PANEL, CURVE_HEIGHT = 2.7, 2.3
-# Ticks of a colour bar are at least so far apart, as a share of its height.
-TICK_SHARE = 0.08
 # What red lines are.
 OUTLINED = "red: perhaps the PSF's error alone"
 
@@ -106,12 +107,12 @@ class ResultView:
 
     def zooms(self) -> list[int]:
         """Return the stars to enlarge: the brightest, in the order that they have."""
-        brightest = np.argsort(-np.asarray(self.star_fluxes), kind="stable")[:MAX_ZOOMS]
+        brightest = np.argsort(-np.asarray(self.star_fluxes), kind="stable")[:MOST_STARS]
         return sorted(brightest.tolist())
 
     def half(self) -> int:
         """Return half the side of an enlarged region, pixels."""
-        return max(ZOOM, round(ZOOM_SHARE * max(self.shape)))
+        return max(16, round(max(self.shape) / 16))
 
 
 @dataclass(frozen=True)
@@ -169,9 +170,9 @@ def draw_result(view: ResultView) -> Figure:
     regions += [Region(f"star {s + 1}", view.stars[s], view.half()) for s in stars]
     has_images = len(view.images) > 0
     shape = (len(regions), 4) if has_images else (-(-len(regions) // 4), min(len(regions), 4))
-    height = PANEL * shape[0]
+    height = 2.7 * shape[0]
     below = [draw_choice, *([draw_light_curves] if view.light_curves else [])]
-    heights = height, *(CURVE_HEIGHT for _ in below)
+    heights = height, *(2.3 for _ in below)
     figure = new_figure(max(3.0 * shape[1], 6.0), sum(heights) + 0.6)
     parts: Any = figure.subfigures(len(heights), 1, height_ratios=heights)
     axes = parts[0].subplots(*shape, squeeze=False)
@@ -303,24 +304,16 @@ def _draw_region(
     axis: Axes, image: NDArray[Any], there: Any, norm: Any, colours: str, oversample: int = 1
 ) -> Any:
     """Draw a part of an image, on axes of pixels so many times as coarse; bad pixels are grey."""
-    from matplotlib import colormaps
-
     # A part alone is drawn, since matplotlib scales all that it is given.
     rows, columns = (part.indices(n) for part, n in zip(there, image.shape, strict=True))
     edges = columns[0], columns[1], rows[0], rows[1]
-    extent = tuple(edge / oversample - 0.5 for edge in edges)
+    left, right, bottom, top = (edge / oversample - 0.5 for edge in edges)
+    extent = left, right, bottom, top
     part = image[there]
     if not part.size:
         axis.text(0.5, 0.5, "not in this image", transform=axis.transAxes, ha="center")
         part, extent = np.full((1, 1), np.nan), (-0.5, 0.5, -0.5, 0.5)
-    return axis.imshow(
-        part,
-        norm=norm,
-        cmap=colormaps[colours].with_extremes(bad="0.6"),
-        origin="lower",
-        interpolation="nearest",
-        extent=extent,
-    )
+    return show_image(axis, part, norm, extent, colours)
 
 
 def _add_bar(axis: Axes, shown: Any, label: str) -> None:
@@ -329,7 +322,7 @@ def _add_bar(axis: Axes, shown: Any, label: str) -> None:
     spread: list[float] = []
     for value in sorted(bar.get_ticks(), reverse=True):
         share = float(shown.norm(value))
-        if 0 <= share <= 1 and (not spread or shown.norm(spread[-1]) - share >= TICK_SHARE):
+        if 0 <= share <= 1 and (not spread or shown.norm(spread[-1]) - share >= 0.08):
             spread.append(value)
     bar.set_ticks(spread)
     bar.set_label(label, fontsize=8)
@@ -347,7 +340,7 @@ def _mark_stars(axis: Axes, stars: Sequence[tuple[float, float]]) -> None:
         _, x, y = np.transpose(inside)
         for colour, width in (("black", 2.4), ("white", 1.1)):
             axis.plot(x, y, "o", ms=11, mfc="none", mec=colour, mew=width)
-    for s, left_of, below in inside if len(inside) <= MAX_NUMBERS else []:
+    for s, left_of, below in inside if len(inside) <= MOST_NUMBERED else []:
         axis.annotate(
             f"{s}", (left_of, below), (6, 6), textcoords="offset points", color="white", fontsize=8
         )

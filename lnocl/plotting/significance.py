@@ -12,13 +12,20 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-from lnocl.plotting.figure import COLOURS, STYLES, as_text, new_figure
+from lnocl.plotting.figure import (
+    COLOURS,
+    MOST_NUMBERED,
+    MOST_STARS,
+    STYLES,
+    as_text,
+    extent_of,
+    new_figure,
+    show_image,
+)
 from lnocl.scene.arrays import Array
 
 # The map of signal-to-noise is shown up to so many thresholds.
 SHOWN = 1.5
-# Stars whose curves are drawn, the first, and detections that are numbered.
-MOST_CURVES, MOST_NUMBERED = 6, 40
 
 
 @dataclass(frozen=True)
@@ -82,14 +89,11 @@ def draw_significance(view: SignificanceView) -> Figure:
 
 
 def _draw_signal(axis: Axes, view: SignificanceView) -> None:
-    from matplotlib import colormaps
+    from matplotlib.colors import Normalize
 
-    signal = np.asarray(view.signal)
-    most = SHOWN * view.threshold
-    shown = axis.imshow(
-        signal, cmap=colormaps["RdBu_r"].with_extremes(bad="0.6"), vmin=-most, vmax=most,
-        origin="lower", interpolation="nearest", extent=_extent(signal, view.oversample),
-    )  # fmt: skip
+    signal, most = np.asarray(view.signal), SHOWN * view.threshold
+    extent = extent_of(signal.shape, view.oversample)
+    shown = show_image(axis, signal, Normalize(-most, most), extent, "RdBu_r")
     axis.figure.colorbar(shown, ax=axis, label="signal-to-noise")
     _mark_stars(axis, view)
     n = 0
@@ -109,17 +113,13 @@ def _draw_signal(axis: Axes, view: SignificanceView) -> None:
 
 
 def _draw_limit(axis: Axes, view: SignificanceView) -> None:
-    from matplotlib import colormaps
     from matplotlib.colors import LogNorm
 
     limit = np.asarray(view.limit)
     good = limit[np.isfinite(limit) & (limit > 0)]
     low, high = (good.min(), np.quantile(good, 0.999)) if good.size else (1.0, 10.0)
-    shown = axis.imshow(
-        limit, cmap=colormaps["viridis"].with_extremes(bad="0.6"),
-        norm=LogNorm(low, max(high, 1.01 * low)), origin="lower", interpolation="nearest",
-        extent=_extent(limit, view.oversample),
-    )  # fmt: skip
+    norm = LogNorm(low, max(high, 1.01 * low))
+    shown = show_image(axis, limit, norm, extent_of(limit.shape, view.oversample))
     axis.figure.colorbar(shown, ax=axis, label=f"flux ({as_text(view.unit)})")
     _mark_stars(axis, view)
     axis.set_title("found with a probability of 50 %", fontsize=9)
@@ -131,7 +131,7 @@ def _draw_curves(axis: Axes, view: SignificanceView) -> None:
     curves = view.curves or {}
     stars = np.asarray(curves["star"], int)
     levels = [name[10:] for name in curves if name.startswith("magnitudes")]
-    for i, star in enumerate(np.unique(stars)[:MOST_CURVES]):
+    for i, star in enumerate(np.unique(stars)[:MOST_STARS]):
         chosen = stars == star
         distance = np.asarray(curves["distance"], float)[chosen]
         for k, level in enumerate(levels):
@@ -151,11 +151,6 @@ def _draw_curves(axis: Axes, view: SignificanceView) -> None:
     axis.grid(alpha=0.3)
     axis.set_title("limits and the probability of being found", fontsize=9)
     axis.legend(fontsize=8)
-
-
-def _extent(values: Array, oversample: int) -> tuple[float, float, float, float]:
-    ny, nx = (n / oversample for n in values.shape)
-    return -0.5, nx - 0.5, -0.5, ny - 0.5
 
 
 def _mark_stars(axis: Axes, view: SignificanceView) -> None:

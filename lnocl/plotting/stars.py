@@ -10,7 +10,7 @@ import numpy as np
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-from lnocl.plotting.figure import COLOURS, new_figure
+from lnocl.plotting.figure import COLOURS, new_figure, show_image
 from lnocl.plotting.result import image_limits
 from lnocl.scene.arrays import Array
 
@@ -41,18 +41,11 @@ def draw_stars(image: Array, stars: Mapping[str, Any]) -> Figure:
     ny, nx = image.shape
     side = 10.0
     figure = new_figure(side * min(1.0, nx / ny) + 1.0, side * min(1.0, ny / nx) + 0.7)
-    from matplotlib import colormaps
     from matplotlib.colors import AsinhNorm
 
     axis = figure.subplots()
     low, high, noise = image_limits(image)
-    axis.imshow(
-        image,
-        norm=AsinhNorm(3.0 * noise, low, high),
-        cmap=colormaps["gray_r"].with_extremes(bad="0.6"),
-        origin="lower",
-        interpolation="nearest",
-    )
+    show_image(axis, image, AsinhNorm(3.0 * noise, low, high), colours="gray_r")
     saturated = np.asarray(stars["saturated"], bool)
     x, y = (np.asarray(stars[name], float) for name in ("x", "y"))
     size = 9 if len(x) <= MAX_NUMBERED else 4

@@ -36,7 +36,9 @@ def ratio_sheared(
 
     As `ratio_rows`, with ``A_j f`` from the sky after its first shear, shape (p, Ny, Nx): its
     columns are shifted by `column_shifts`, shape (p, Nx), then its rows by `image_shifts`, (p, Ny).
+    Of images with fewer pixels each `oversample`-th is one, and 0 is in the others.
     """
+    oversample = sheared.shape[-1] // images.shape[-1]
     seen = np.array(
         [
             shifted(shifted(pixels.T, along_y, 1).T, along_x, 1)
@@ -44,9 +46,11 @@ def ratio_sheared(
         ]
     )
     excess, objective, star_sums = compare(
-        seen, images, weights, background, star_images, star_fluxes
+        seen[:, ::oversample, ::oversample], images, weights, background, star_images, star_fluxes
     )
-    back = [shifted(each, shifts, -1) for each, shifts in zip(excess, image_shifts, strict=True)]
+    laid = np.zeros_like(sheared)
+    laid[:, ::oversample, ::oversample] = excess
+    back = [shifted(each, shifts, -1) for each, shifts in zip(laid, image_shifts, strict=True)]
     return np.array(back), objective, star_sums
 
 

@@ -283,7 +283,8 @@ def _step(
         parameters, stars = _follow(families, parameters, change.parameters), change.positions
         if moves:  # which a common shift is not told from
             parameters, common = families.without_common_shift(parameters)
-            stars = stars + common / found.scene.oversample
+            is_through = found.scene.owned[:: found.scene.n_epochs, None] < 0
+            stars = stars + is_through * common / found.scene.oversample
         psfs = families.psfs_over_images(parameters)
         found = runs.moved(found, psfs, change.star_fluxes, stars)
     return parameters, found.scene.places

@@ -125,7 +125,8 @@ class Camera(LinearMap):
     rotation : Rotation or None
         How the image is turned.
     place : tuple of ndarray of float64
-        M, shape (2, 2), and t, (2,): a source at x is in the image at ``M x + t``.
+        M, shape (2, 2), and t, (2,), of `Observation.on_fine_pixels`: pixel u of the sky is at
+        ``M u + t`` in the image.
     grid, image_grid : tuple of int
         Shapes of the sky and of the image.
     flat, back_flat : float
@@ -141,7 +142,7 @@ class Camera(LinearMap):
         self.grid = self._grid = self.key = scene.grid
         self.psf, self.image_grid = scene.psf_cutout(j), scene.image_grid
         self.rotation = scene.rotations[j] if scene.rotations else None
-        self.place = scene.observation.turns[j], scene.observation.offsets[j]
+        self.place = scene.observation.on_fine_pixels(j)[:2]
         if scene.transmission is not None:
             self.transmission = scene.transmission[j]
             self.key = self.grid, self.transmission.ctypes.data
@@ -178,7 +179,7 @@ class Camera(LinearMap):
         spectrum, rotation, shift = self.spectrum(sky), self.rotation, self.place[1]
         v, u = np.fft.fftfreq(self.grid[0])[:, None], np.fft.rfftfreq(self.grid[1])
         if rotation is None:
-            dx, dy = self._oversample * shift
+            dx, dy = shift
             return np.asarray(spectrum * np.exp(-2j * np.pi * (u * dx + v * dy)))
         c, s = (rotation.scale * f(rotation.angle) for f in (math.cos, math.sin))
         is_held = (abs(c * u - s * v) <= 0.5) & (abs(s * u + c * v) <= 0.5)
@@ -187,7 +188,9 @@ class Camera(LinearMap):
 
     def unsampled(self, image: Array) -> Spectrum:
         """Return the spectrum of an image where it lies on the sky."""
-        return super().unsampled(self.rotation.adjoint(image) if self.rotation else image)
+        if self.rotation is None:
+            return super().unsampled(image)
+        return self._transform(self.rotation.adjoint(spread(image, self._oversample)), ...)
 
     def point(self) -> Array:
         """Return what the image has of a point at the origin, shape (Ny, Nx)."""
@@ -218,7 +221,9 @@ class Camera(LinearMap):
         if self.rotation is None:
             return spread(image, self._oversample)
         y, x = np.nonzero(image)
-        places = np.array(self._scene.observation.geometry.on_sky(self._j, x, y))[::-1]
+        turn, offset = self.place
+        pixels = self._oversample * np.stack([x, y], axis=1)
+        places = np.linalg.solve(turn, (pixels - offset).T)[::-1]
         first = np.floor(places).astype(int)
         sky = np.zeros(math.prod(self.grid))
         for step in np.ndindex(2, 2):
@@ -314,13 +319,14 @@ class TurnedWindow(LinearMap):
     def __init__(
         self, camera: Camera, rotation: Rotation, seen: Ranges, sky: Ranges | None
     ) -> None:
-        (turn, shift), (rows, columns), scale = camera.place, seen, rotation.scale
+        self.shape, self._oversample = (len(seen[0]), len(seen[1])), camera._oversample
+        (turn, shift), (rows, columns) = camera.place, map(camera.fine, seen)
+        scale = rotation.scale
         corners = [(x, y) for x in (columns[0], columns[-1]) for y in (rows[0], rows[-1])]
         places = np.linalg.solve(turn, (np.array(corners) - shift).T).T
         margin = np.array(camera.psf.values.shape[::-1]) // 2 + TAPS
         first = np.floor(places.min(axis=0) - margin).astype(int)
         last = np.ceil(places.max(axis=0) + margin).astype(int)
-        self.shape = len(rows), len(columns)
         slope = abs(math.tan(rotation.angle / 2.0))
         sheared = scale * (len(columns) + slope * len(rows) + TAPS) + TAPS
         needed = np.maximum(last - first + 1, (math.ceil(sheared), len(rows)))
@@ -332,10 +338,11 @@ class TurnedWindow(LinearMap):
         if camera.transmission is not None:
             self.transmission = _part(camera.transmission, self.reached)
         shift = turn @ first + shift - (columns[0], rows[0])
-        box = range(self.shape[0]), range(self.shape[1])
+        box = range(len(rows)), range(len(columns))
         self._rotation = rotation = Rotation(rotation.angle, shift, self._grid, box, scale)
         self._otf = scipy.fft.rfft2(camera.psf.on_grid(self._grid)) * rotation.undone()
-        self._phases, self._shears = rotation.row_phases(), rotation.matrix(self.shape)
+        self._phases = rotation.row_phases()
+        self._shears = rotation.matrix(self.shape, self._oversample)
 
     def seen(self, spectrum: Spectrum) -> Array:
         """Return the image of the sky that has this spectrum."""
@@ -436,11 +443,11 @@ def sampled(sky: Array, oversample: int) -> Array:
     return sky[..., ::oversample, ::oversample]
 
 
-def spread(image: Array, oversample: int) -> Array:
+def spread(image: Array, oversample: int, beside: float = 0.0) -> Array:
     """Return the adjoint of `sampled`: the pixels of an image on the sky's, 0 between them."""
     if oversample == 1:
         return image
-    sky = np.zeros([oversample * n for n in image.shape])
+    sky = np.full([oversample * n for n in image.shape], beside)
     sky[::oversample, ::oversample] = image
     return sky
 

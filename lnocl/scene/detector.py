@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from lnocl.scene.arrays import Array
 from lnocl.scene.observation import Observation
-from lnocl.scene.shifting import Cutout, MovablePsf
+from lnocl.scene.shifting import ENDLESS, Cutout, MovablePsf
 
 
 def movable_psfs(
@@ -23,20 +23,27 @@ def movable_psfs(
     return [DetectorPsf(psf, grid, oversample, are_effective) for psf in psfs]
 
 
-def pixel_spectrum(
-    v: NDArray[Any], u: NDArray[Any], observation: Observation
-) -> NDArray[np.complex128]:
+def pixel_spectrum(v: NDArray[Any], u: NDArray[Any], observation: Observation) -> Array:
     """Return the factors by which pixels change the spectra of PSFs, at frequencies 1 / pixel.
 
-    Those of the response h over those of K (`DetectorPsf`); 1 without oversampling.
+    Those of the response h over those of K (`DetectorPsf`), each about its middle; 1 without
+    oversampling.
     """
     q = observation.oversample
     if observation.effective_psfs:
-        return np.asarray(q**2 * np.exp(1j * np.pi * (q - 1) * (u + v)))
-    along, across = (
-        np.exp(2j * np.pi * np.multiply.outer(each, np.arange(q))).sum(axis=-1) for each in (v, u)
-    )
+        return np.full(np.broadcast_shapes(v.shape, u.shape), float(q**2))
+    places = 2.0 * np.pi * (np.arange(q) - (q - 1) / 2.0)
+    along, across = (np.cos(np.multiply.outer(each, places)).sum(axis=-1) for each in (v, u))
     return np.asarray(along * across)
+
+
+def psfs_with_pixels(observation: Observation) -> list[Array]:
+    """Return the PSFs as pixels of the images see points of a finer sky; their sums stay."""
+    q = observation.oversample
+    if q == 1 or observation.effective_psfs:
+        return list(observation.psfs)
+    movable = movable_psfs(observation.psfs, observation, ENDLESS)
+    return [psf.on_sky(0.0, 0.0).about_origin() / q**2 for psf in movable]
 
 
 def seen_psfs(observation: Observation, psfs: Array | None = None) -> Array:

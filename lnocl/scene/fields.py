@@ -27,7 +27,7 @@ from lnocl.scene.geometry import read_geometry
 from lnocl.scene.halos import read_halos
 from lnocl.scene.psfs import read_ideal_psfs, read_pixels, read_psfs
 from lnocl.scene.star_psfs import read_star_places, read_star_psfs
-from lnocl.scene.transforms import of_one_shape, refuse_other_shapes
+from lnocl.scene.transforms import of_one_shape, refuse_other_shapes, shapes_of
 from lnocl.scene.uncertainties import is_uncertainty, without_source
 
 if TYPE_CHECKING:
@@ -280,12 +280,16 @@ FIELDS = {
 
 def in_one_shape(given: dict[str, Any], shapes: Sequence[tuple[int, int]]) -> dict[str, Any]:
     """Return images of several shapes, and their maps, with bad pixels added to smaller ones."""
-    found = {}
-    for name, field in FIELDS.items():
-        if field.axes == "pixels" and field.of_images == 0:
-            refuse_other_shapes(name, given[name], shapes)
-            found[name] = of_one_shape(given[name], field.beyond)
-    return found
+
+    def laid(name: str, field: Field, maps: Any) -> Any:
+        if field.of_images and isinstance(maps, (list, tuple)) and not shapes_of(maps):
+            return [laid(name, field, each) for each in maps]
+        if not field.of_images or len(set(shapes_of(maps))) > 1:  # else a halo of all images
+            refuse_other_shapes(name, maps, shapes)
+        return of_one_shape(maps, field.beyond)
+
+    fields = FIELDS.items()
+    return {k: laid(k, field, given[k]) for k, field in fields if field.axes == "pixels"}
 
 
 def hold(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -25,6 +26,7 @@ from lnocl.scene.transforms import (
 
 if TYPE_CHECKING:
     from lnocl.scene.observation import Observation
+    from lnocl.scene.psf_field import PsfField
 
 MOVES = "offsets", "transforms"
 
@@ -199,6 +201,14 @@ class Geometry:
             orientations=orientations,
         )
 
+    def middle(self, j: int) -> Array:
+        """Return where the middle (x, y) of image j as given is, as the images lie."""
+        ny, nx = self.given_shape
+        middle = (nx - 1) / 2.0, (ny - 1) / 2.0
+        if not self.orientations:
+            return np.array(middle)
+        return self.orientations[j].map(self.shape) @ (*middle, 1.0)
+
     def turned(self, values: NDArray[Any], fill: float | None, axis: int = 0) -> NDArray[Any]:
         """Return arrays of the images as given, or of their PSFs, by index as `upright` has them.
 
@@ -212,17 +222,24 @@ class Geometry:
         axis : int, optional
             The axis of the images.
         """
-        each = np.moveaxis(values, axis, 0)
-        if fill is None:
-            sides = each.shape[-2:]
-            if any(orientation.swaps for orientation in self.orientations):
-                sides = (max(sides),) * 2
-            ny, nx = (side + 1 - side % 2 for side in sides)  # odd, so that centres stay
-            each = enlarged(each, (ny, nx), is_centred=True)
-        else:
-            each = enlarged(each, self.shape, fill)
+        each = self._enlarged(np.moveaxis(values, axis, 0), fill)
         pairs = zip(self.orientations, each, strict=True)
         return np.moveaxis(np.array([by.of(array) for by, array in pairs]), 0, axis)
+
+    def turned_fields(self, fields: Sequence[PsfField]) -> tuple[PsfField, ...]:
+        """Return the fields of PSFs of the images as given as `upright` has them."""
+        enlarged = (field.mapped(partial(self._enlarged, fill=None)) for field in fields)
+        pairs = zip(enlarged, self.orientations, strict=bool(fields))
+        return tuple(field.turned(by.of, by.map(self.shape)) for field, by in pairs)
+
+    def _enlarged(self, values: NDArray[Any], fill: float | None) -> NDArray[Any]:
+        if fill is not None:
+            return enlarged(values, self.shape, fill)
+        sides = values.shape[-2:]
+        if any(orientation.swaps for orientation in self.orientations):
+            sides = (max(sides),) * 2
+        ny, nx = (side + 1 - side % 2 for side in sides)  # odd, so that centres stay
+        return enlarged(values, (ny, nx), is_centred=True)
 
     def as_given(self, images: NDArray[Any], cut: bool) -> NDArray[Any]:
         """Return images (p, ny, nx) in the orientation of those given, cut to their shape."""
@@ -258,13 +275,8 @@ def read_geometry(
         raise InputError("the images were turned upright; give `transforms` to an Observation")
     offsets = given.get("offsets", known.offsets if known and is_kept else None)
     maps = given.get("transforms", known.maps if known and known.is_mapped else None)
-    beside = {
-        "offsets": "offsets" in given and offsets is not None,
-        "oversample": held.oversample > 1,
-        "PSFs that vary over the field": bool(held.psf_fields),
-    }
-    if maps is not None and (names := [name for name, is_given in beside.items() if is_given]):
-        raise InputError(f"`transforms` are not taken beside {names[0]}; give one of them")
+    if maps is not None and given.get("offsets") is not None:
+        raise InputError("`transforms` are not taken beside offsets, which they hold")
     if before is not None and known and is_kept and held.mask is before.mask:
         found = known
     elif maps is None:
@@ -276,7 +288,10 @@ def read_geometry(
         kept = "frame", "given_shape", "orientations"
         found = replace(found, **{name: getattr(known, name) for name in kept})
     low, high = min(found.scales), max(found.scales)
-    if images[0] > 1 and held.psfs.strides[0] == 0 and low < high:
+    fields = [field.numbers() for field in held.psf_fields]
+    are_one = all(np.array_equal(each, fields[0]) for each in fields[1:])
+    is_one = are_one if fields else held.psfs.strides[0] == 0
+    if images[0] > 1 and is_one and low < high:
         raise InputError(
             f"one PSF is given for images whose pixels are {low:.4g} and {high:.4g} times the "
             "sky's; give one for each image, on its own pixels"

@@ -81,21 +81,23 @@ def psf_shape(observation: Observation) -> tuple[int, int]:
 def extent(observation: Observation) -> tuple[int, int]:
     """Return the shape of what holds the sky of images that are turned, and what it passes through.
 
+    It is in pixels of the images, finer ones by `oversample` of which are the sky's.
     That is the frame of the sky, the corners of all images in it, and what two of the three shears
     leave of each (`lnocl.scene.rotation.Rotation`): a grid is a period, and rows and columns that
     an image needs lie on one side of its ends. The ends of rows are those of a block of phases.
     """
     height, width = observation.sky_shape
     corners, needed = [np.array([(0.0, 0.0), (width - 1.0, height - 1.0)])], np.zeros(2)
-    for j, turn in enumerate(observation.turns):
-        rows, columns = box = observation.good_box(j)
-        corners.append(observation.geometry.corners(j, box))
+    for j in range(observation.n_images):
+        turn, shift, (rows, columns) = observation.on_fine_pixels(j)
+        ends = [(x, y) for x in (columns[0], columns[-1]) for y in (rows[0], rows[-1])]
+        corners.append(np.linalg.solve(turn, (np.array(ends) - shift).T).T)
         scale, slope = observation.scales[j], abs(math.tan(math.atan2(turn[1, 0], turn[0, 0]) / 2))
         sheared = scale * (len(columns) + slope * len(rows))
         taps = TAPS * (1.0 if scale == 1.0 else 1.0 + scale)
         needed = np.maximum(needed, (sheared + taps, np.ptp(corners[-1][:, 1]) + taps + PHASE_ROWS))
     size = np.maximum(np.ptp(np.concatenate(corners), axis=0) + TAPS, needed)
-    x, y = (np.ceil(size).astype(int) + 1).tolist()
+    x, y = (-(-(np.ceil(size).astype(int) + 1) // observation.oversample)).tolist()
     ny, nx = observation.shape
     return max(y, ny, LEAST_TURNED), max(x, nx, LEAST_TURNED)
 

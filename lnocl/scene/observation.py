@@ -84,8 +84,9 @@ class Observation:
         without a flip, a scale and a shift; `lnocl.rotations` makes those of field rotation. Pixels
         of an image are as large as the sky's, or larger by the inverse of the scale. The sky is
         turned and sampled in the model; no counts are resampled. PSFs are as the images show them,
-        on their pixels, and hold what a pixel collects. Images, and PSFs, of several shapes may be
-        given as lists of arrays, and maps with them; bad pixels are added to smaller ones.
+        on their pixels, and hold what a pixel collects. With `oversample` sky and PSFs are finer,
+        and the maps those between pixels of images still. Images, and PSFs, of several shapes may
+        be given as lists of arrays, and maps with them; bad pixels are added to smaller ones.
     transmission : array_like, shape (p, Ny, Nx) or (Ny, Nx), optional
         Share of the light of each pixel of the sky that each image gets, 0 to 1, before the PSF
         spreads it: that of a coronagraph, or of vignetting on the sky. One serves all images. The
@@ -197,8 +198,8 @@ class Observation:
         - A halo is 0 on all good pixels of an image.
         - `transmission` is not of the sky's shape, out of range, or 0 everywhere.
         - A label of `epochs` is missing or not a number, or the labels have no order.
-        - `transforms` are given beside `offsets`, `oversample` or PSFs that vary over the field,
-          shear the images by more than 0.05 pixels, or are for pixels smaller than the sky's.
+        - `transforms` are given beside `offsets`, shear the images by more than 0.05 pixels, or are
+          for pixels smaller than those of the image that the sky is of.
 
     Warns
     -----
@@ -287,7 +288,7 @@ class Observation:
         into = partial(normalised, psf_centre=psf_centre)
         self.psf_fields = tuple(field.mapped(into) for field in self.psf_fields)
         if self.psf_fields:
-            self.psfs = at_middle(self.psf_fields, self.shape)
+            self.psfs = at_middle(self)
         else:
             self.psfs = into(self.psfs, shapes=shapes_of(psfs))
         if ideal_psfs is not None:
@@ -405,9 +406,20 @@ class Observation:
         """Return which positions, shape (n, 2), lie within any image, its offset added."""
         return self.geometry.shows(positions)
 
-    def good_box(self, j: int) -> tuple[range, range]:
+    def good_box(self, j: int) -> Box:
         """Return the rows and columns of image j that hold its good pixels; all if it has none."""
         return good_box(self.mask[j])
+
+    def on_fine_pixels(self, j: int) -> tuple[Array, Array, Box]:
+        """Return the map from the sky to image j, and its `good_box`, in pixels as fine as the sky.
+
+        Those of the image are numbered from the middle of its first, and its own are each
+        `oversample`-th of them. So pixel u of the sky is at ``M u + t``, shapes (2, 2) and (2,).
+        """
+        q, turn = self.oversample, self.turns[j]
+        rows, columns = (range(q * at.start, q * at.stop) for at in self.good_box(j))
+        shift = q * self.offsets[j] - (q - 1) / 2.0 * turn.sum(axis=1)
+        return turn, shift, (rows, columns)
 
     def upright(self) -> Observation:
         """Return the observation with quarter turns and flips of its images undone, by index.
@@ -418,7 +430,8 @@ class Observation:
         geometry = self.geometry.upright()
         if geometry is self.geometry:
             return self
-        changes: dict[str, Any] = {"geometry": geometry}
+        fields = geometry.turned_fields(self.psf_fields)
+        changes: dict[str, Any] = {"geometry": geometry, "psf_fields": fields}
         for name, field in FIELDS.items():
             values = getattr(self, name)
             if field.axes in ("pixels", "psf") and values.ndim > 2 and values.size:

@@ -109,7 +109,7 @@ class PsfFamilies:
         self, names: Sequence[str], observation: Observation, scatter: Array = NO_SCATTER
     ) -> None:
         self._names, self._psfs = names, observation.psfs
-        self._over_images = observation.psfs_over_images
+        self._over_images, self._turns = observation.psfs_over_images, observation.turns
         self._ideals, modes = observation.ideal_psfs, observation.psf_modes
         self._pupils = [Pupil(each) for each in observation.pupils] if "pupil" in names else []
         if "modes" not in names:
@@ -178,11 +178,12 @@ class PsfFamilies:
         return mapped(psfs, change)
 
     def without_common_shift(self, parameters: PsfParameters) -> tuple[PsfParameters, Array]:
-        """Return parameters with shifts of mean 0 over the PSFs, and that mean, (x, y)."""
+        """Return parameters without what a shift of the sky does alike, and that shift, (x, y)."""
         common, values = np.zeros(2), parameters.values
         if "shift" in self._names:
-            common = values[:, :2].mean(axis=0)
-            values = np.hstack([values[:, :2] - common, values[:, 2:]])
+            shifts, turns = values[:, :2], self._turns
+            common[:] = np.linalg.lstsq(turns.reshape(-1, 2), shifts.ravel())[0]
+            values = np.hstack([shifts - turns @ common, values[:, 2:]])
         return parameters._replace(values=values), common
 
     def are_possible(self, parameters: PsfParameters) -> bool:

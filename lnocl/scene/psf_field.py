@@ -68,8 +68,7 @@ class PsfField:
             raise InputError("positions of PSFs must be finite")
         self._x, self._y = np.unique(places[:, 0]), np.unique(places[:, 1])
         order = np.lexsort((places[:, 0], places[:, 1]))
-        grid = np.stack(np.meshgrid(self._x, self._y), axis=-1).reshape(-1, 2)
-        if not np.array_equal(places[order], grid):
+        if not np.array_equal(places[order], self._positions):
             raise InputError(
                 f"the positions of {counted(len(stack), 'PSF')} do not fill a grid of "
                 f"{len(self._x)} columns and {len(self._y)} rows; give one PSF for each node"
@@ -125,6 +124,18 @@ class PsfField:
     def numbers(self) -> Array:
         """Return all numbers that it holds, for a checksum."""
         return np.concatenate([self._psfs.ravel(), self._x, self._y])
+
+    @property
+    def _positions(self) -> Array:
+        return np.stack(np.meshgrid(self._x, self._y), axis=-1).reshape(-1, 2)
+
+    def turned(self, function: Callable[[Array], Array], transform: Array) -> PsfField:
+        """Return a field of what a function makes of all PSFs, at places by a map, shape (2, 3).
+
+        That is one by quarter turns and flips.
+        """
+        places = self._positions @ transform[:, :2].T + transform[:, 2]
+        return PsfField(function(self._psfs.reshape(-1, *self.shape)), places)
 
     def moved(self, dx: float, dy: float) -> PsfField:
         """Return the same PSFs with all positions moved."""

@@ -11,7 +11,8 @@ from numpy.typing import ArrayLike
 from lnocl.errors import InputError, counted, note, warn
 from lnocl.scene.arrays import Array, numbers, pixels, stack
 from lnocl.scene.cores import centre, off_centre, peak
-from lnocl.scene.psf_field import PsfField, read_fields
+from lnocl.scene.geometry import Geometry
+from lnocl.scene.psf_field import read_fields
 from lnocl.scene.quantities import bare
 from lnocl.scene.shifting import place
 from lnocl.scene.transforms import enlarged
@@ -68,7 +69,7 @@ def read_psfs(field: Field, psfs: Any, held: Observation) -> Array:
         each.mapped(lambda stack: check_psfs(field.name, stack, len(stack))) for each in fields
     )
     if fields:
-        return at_middle(held.psf_fields, held.shape)
+        return at_middle(held)
     return check_psfs(field.name, psfs, held.n_images)
 
 
@@ -115,10 +116,12 @@ def read_pixels(field: Field, values: Any, held: Observation) -> Array:
     return np.broadcast_to(given, (p, *given.shape[1:])).copy()
 
 
-def at_middle(fields: Sequence[PsfField], shape: tuple[int, int]) -> Array:
-    """Return the PSFs that fields have in the middle of images of a shape."""
-    y, x = (np.array(shape) - 1) / 2.0
-    return np.array([field.at(x, y) for field in fields])
+def at_middle(held: Observation) -> Array:
+    """Return the PSFs that fields have in the middle of their images."""
+    known: Geometry | None = vars(held).get("geometry")
+    if known is None or (len(known.turns), *known.shape) != held.images.shape:  # another comes
+        known = Geometry.shifted(None, held.n_images, held.shape)
+    return np.array([field.at(*known.middle(j)) for j, field in enumerate(held.psf_fields)])
 
 
 def own(psfs: Array) -> Array:

@@ -152,19 +152,20 @@ class Rotation:
         phases[:, -1] = phases[:, -1].real
         return np.asarray(phases)
 
-    def matrix(self, shape: tuple[int, int]) -> csr_array:
+    def matrix(self, shape: tuple[int, int], step: int = 1) -> csr_array:
         """Return the second and the third shear as a matrix, for the first pixels of the image.
 
-        Its columns are the pixels of the grid, its rows those of a window of this shape.
+        Its columns are the pixels of the grid, its rows each `step`-th along both axes, in a window
+        of this shape.
         """
         from scipy.sparse import csr_array  # which takes its time to load
 
         (ny, nx), (height, width) = self.grid, shape
-        along_x, x_weights = whole_and_weights(self.image_shifts[:height])
+        along_x, x_weights = whole_and_weights(self.image_shifts[: step * height : step])
         along_y, y_weights = whole_and_weights(self.column_shifts)
         taps = np.arange(TAPS) - TAPS // 2 + 1
-        x = (np.arange(width)[:, None] + along_x[:, None, None] + taps) % nx
-        y = (np.arange(height)[:, None, None, None] + along_y[x][..., None] + taps) % ny
+        x = (step * np.arange(width)[:, None] + along_x[:, None, None] + taps) % nx
+        y = (step * np.arange(height)[:, None, None, None] + along_y[x][..., None] + taps) % ny
         weights = x_weights[:, None, :, None] * y_weights[x]
         starts = TAPS**2 * np.arange(height * width + 1)
         places = (y * nx + x[..., None]).ravel()

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from copy import copy
-from functools import cached_property, partial
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from lnocl.errors import InputError
 from lnocl.scene.arrays import Array, numbers
 from lnocl.scene.counts import mean_exposure
-from lnocl.scene.detector import DetectorPsf, movable_psfs, on_sky
+from lnocl.scene.detector import DetectorPsf, movable_psfs, on_sky, psfs_with_pixels
 from lnocl.scene.first_estimate import RoughFit, first_estimate, level_beside, rough_fit
 from lnocl.scene.grid import grid_of
 from lnocl.scene.halos import halo_cutouts
@@ -161,15 +161,14 @@ class Scene:
         self.unit = self._sky_unit(self.mean_exposure)
         relative = exposure / self.mean_exposure
         self.gains = np.ones(self.n_images) if has_map else relative
-        self._psfs = movable_psfs(self.scaled_psfs(), observation, self.image_grid)
+        self._psfs = self._movable(self.scaled_psfs())
         self.areas = (self.oversample * observation.scales) ** 2
         self.transmission = self._transmission()
         self.seen_areas = self.areas.copy()
         if self.transmission is not None:
             self.seen_areas *= observation.transmission.mean(axis=(1, 2))
         self.rotations = self._rotations()
-        movable = partial(movable_psfs, observation=observation, grid=self.image_grid)
-        self._own = StarPsfs(observation, self.gains, movable, self.grid)
+        self._own = StarPsfs(observation, self.gains, self._movable, self.grid)
         self.weights = self._weigh(relative if has_map else None)
         self._halos = (
             halo_cutouts(observation.halos, self.weights, has_map, self.image_grid)
@@ -194,12 +193,12 @@ class Scene:
         observation = self.observation
         if not observation.is_turned:
             return []
-        angles = np.arctan2(observation.turns[:, 1, 0], observation.turns[:, 0, 0]).tolist()
-        scales = observation.scales.tolist()
-        return [
-            Rotation(angles[j], shift, self.grid, observation.good_box(j), scales[j])
-            for j, shift in enumerate(observation.offsets)
-        ]
+        rotations = []
+        for j, scale in enumerate(observation.scales.tolist()):
+            turn, shift, box = observation.on_fine_pixels(j)
+            angle = float(np.arctan2(turn[1, 0], turn[0, 0]))
+            rotations.append(Rotation(angle, shift, self.grid, box, scale))
+        return rotations
 
     def _transmission(self) -> Array | None:
         given = self.observation.transmission
@@ -219,18 +218,26 @@ class Scene:
         shares = (map_coordinates(t, at, order=1, mode="nearest") for t in self.transmission)
         return np.array(list(shares))
 
-    def psfs_of_sky(self) -> list[Array]:
-        """Return the PSFs as the sky sees them, of unit sum: turned back, on the sky's pixels."""
+    def psfs_of_sky(self, with_pixels: bool = False) -> list[Array]:
+        """Return the PSFs as the sky sees them, of unit sum: turned back, on the sky's pixels.
+
+        They may have the pixels of the images besides.
+        """
+        psfs = psfs_with_pixels(self.observation) if with_pixels else list(self.observation.psfs)
         if not self.rotations:
-            return list(self.observation.psfs)
-        psfs = zip(self.observation.psfs, self.rotations, strict=True)
-        return [turned_psf(psf, rotation.angle, rotation.scale) for psf, rotation in psfs]
+            return psfs
+        pairs = zip(psfs, self.rotations, strict=True)
+        return [turned_psf(psf, rotation.angle, rotation.scale) for psf, rotation in pairs]
 
     @cached_property
     def _psfs_of_sky(self) -> list[MovablePsf]:
         """Those, times the relative exposure of their image where that is a number."""
-        psfs = zip(self.gains, self.psfs_of_sky(), strict=True)
-        return [MovablePsf(gain * psf, self.grid) for gain, psf in psfs]
+        return [MovablePsf(psf, self.grid) for psf in self.scaled_psfs(self.psfs_of_sky())]
+
+    @cached_property
+    def _responses_of_sky(self) -> list[MovablePsf]:
+        """The same with the pixels of the images."""
+        return [MovablePsf(psf, self.grid) for psf in self.scaled_psfs(self.psfs_of_sky(True))]
 
     def _penalise(self, penalty: Penalty) -> None:
         self.penalty = penalty
@@ -260,8 +267,9 @@ class Scene:
         """Return this scene with other PSFs, as they are."""
         other = copy(self)
         other.observation = self.observation.replace(psfs=psfs)
-        other._psfs = movable_psfs(other.scaled_psfs(), other.observation, self.image_grid)
-        vars(other).pop("_psfs_of_sky", None)
+        other._psfs = other._movable(other.scaled_psfs())
+        for name in ("_psfs_of_sky", "_responses_of_sky"):
+            vars(other).pop(name, None)
         other._field = other._place_stars(self.stars)
         return other
 
@@ -321,17 +329,16 @@ class Scene:
         observation, fields = self.observation, self.observation.psf_fields
         if not fields and part is None and self.transmission is None:
             return [[psf] * len(positions) for psf in self._psfs]
-        movable = partial(movable_psfs, observation=observation, grid=self.image_grid)
         if not fields and self.transmission is None:
-            parts = movable([psf[part] for psf in self.scaled_psfs()])
+            parts = self._movable([psf[part] for psf in self.scaled_psfs()])
             return [[psf] * len(positions) for psf in parts]
         shares = self.gains[:, None] * self.transmitted(positions)
         psfs = [
-            [field.at(*place) for place in positions + offset]
-            for field, offset in zip(fields, observation.offsets, strict=bool(fields))
+            [field.at(*place) for place in observation.places(j, positions)]
+            for j, field in enumerate(fields)
         ] or [[psf] * len(positions) for psf in observation.psfs]
         return [
-            movable([share * psf[part or ...] for share, psf in zip(*each, strict=True)])
+            self._movable([share * psf[part or ...] for share, psf in zip(*each, strict=True)])
             for each in zip(shares, psfs, strict=True)
         ]
 
@@ -476,10 +483,7 @@ class Scene:
 
         Where images are turned `psf` has what their weights need besides; its squares mean nothing.
         """
-        if not self.rotations:
-            return self.psf(j)
-        cutout = self._psfs_of_sky[j].at(0.0, 0.0)
-        return float(self.areas[j]) * cutout.on_grid(self.grid)
+        return self.psf_cutout(j).on_grid(self.grid)
 
     def psf_cutout(self, j: int) -> Cutout:
         """Return the response of image j where it is not 0, the sky moved by the offset.
@@ -489,7 +493,7 @@ class Scene:
         image that is turned it is the PSF turned back, as bright as the image's pixels are large.
         """
         if self.rotations:
-            cutout = self._psfs_of_sky[j].at(0.0, 0.0)
+            cutout = self._responses_of_sky[j].at(0.0, 0.0)
             return cutout._replace(values=self.areas[j] * cutout.values)
         return self._psfs[j].response(*self.observation.offsets[j])
 
@@ -525,10 +529,13 @@ class Scene:
         """The stars where they are now."""
         return self._field
 
-    def scaled_psfs(self) -> list[Array]:
-        """Return the PSFs times the relative exposure of their image, where that is a number."""
-        psfs = zip(self.gains, self.observation.psfs, strict=True)
-        return [psf if gain == 1.0 else gain * psf for gain, psf in psfs]
+    def _movable(self, psfs: Iterable[Array]) -> list[MovablePsf | DetectorPsf]:
+        return movable_psfs(psfs, self.observation, self.image_grid)
+
+    def scaled_psfs(self, psfs: Iterable[Array] | None = None) -> list[Array]:
+        """Return PSFs times the relative exposure of their image, where that is a number."""
+        pairs = zip(self.gains, self.observation.psfs if psfs is None else psfs, strict=True)
+        return [psf if gain == 1.0 else gain * psf for gain, psf in pairs]
 
     def star_box(self, j: int, s: int) -> Covered:
         """Return the rows and columns of the images' grid that star s may light in image j."""

@@ -75,6 +75,13 @@ class Cutout(NamedTuple):
         values = np.roll(self.values, (y[0], x[0]), axis=(0, 1)) if y[0] or x[0] else self.values
         return Cutout(values, y[1], x[1])
 
+    def about_origin(self) -> Array:
+        """Return the values on an array with the origin of the grid in its middle."""
+        ends = zip(self[1:], self.values.shape, strict=True)
+        halves = [max(-first, first + size - 1) for first, size in ends]
+        laid = np.zeros([2 * half + 1 for half in halves])
+        return self.add_to(laid, (-halves[0], -halves[1]), ENDLESS)
+
     def blurred(self, deviation: float, grid: tuple[int, int]) -> Cutout:
         """Return the values convolved with a Gaussian of this standard deviation, pixels.
 

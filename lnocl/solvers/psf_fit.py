@@ -23,7 +23,7 @@ from scipy.ndimage import gaussian_filter
 
 from lnocl.scene.arrays import Array
 from lnocl.scene.camera import sampled, spread
-from lnocl.scene.detector import on_sky, pixel_spectrum
+from lnocl.scene.detector import pixel_spectrum
 from lnocl.scene.estimate import Estimate
 from lnocl.scene.forward_model import Model
 from lnocl.scene.psf_families import PsfFamilies, PsfParameters, Spectrum, spectrum
@@ -163,14 +163,14 @@ def _psf_slopes(
 def _sky(model: Model, j: int, extended: Array, fluxes: Array) -> Spectrum:
     """Return the spectrum of all that PSF j is convolved with: stars, extended source, pixels.
 
-    It is in the frame of the image.
+    It is in the frame of the image, whose pixels are each `oversample`-th of the sky's.
     """
     scene = model.scene
     u, v = np.fft.rfftfreq(scene.grid[1])[None, :], np.fft.fftfreq(scene.grid[0])[:, None]
     places, shares = scene.star_field.places[j], scene.transmitted(scene.stars)[j]
     sky = scene.areas[j] / scene.oversample**2 * model.cameras[j].in_frame(extended)
     for s in np.flatnonzero(scene.shown[:, j] & scene.through_psfs):
-        x, y = on_sky(places[s], scene.oversample)
+        x, y = scene.oversample * places[s]
         sky = sky + shares[s] * fluxes[s] * np.exp(-2j * np.pi * (u * x + v * y))
     return np.asarray(sky * (scene.gains[j] * pixel_spectrum(v, u, scene.observation)))
 

@@ -2,24 +2,16 @@
 
 from __future__ import annotations
 
-import io
 import math
-import os
 import time
 import warnings
 from collections.abc import Collection, Iterator, Sequence
 from typing import Any, NamedTuple
 
-import numpy as np
-from astropy.table import Table
-
-from lnocl import __version__, metrics
+from lnocl import metrics
 from lnocl.deconvolution import deconvolve
-from lnocl.errors import InputError, LnoclError, LnoclWarning, MisfitWarning
-from lnocl.io import atomic
+from lnocl.errors import InputError, LnoclWarning, MisfitWarning
 from lnocl.opencl.device import choose, describe
-from lnocl.plotting.curves import draw_costs
-from lnocl.plotting.figure import check_matplotlib, save_figure
 from lnocl.result import Estimate, Result
 from lnocl.runs.options import PAPER
 from lnocl.scene.arrays import Array, whole
@@ -29,15 +21,15 @@ from lnocl.simulation import hh34, simulate
 # Estimates are measured after an eighth, a quarter, half and all of the iterations.
 PARTS = (8, 4, 2, 1)
 
-# Columns of the table: unit, width and format on the terminal, and description.
+# Columns of the table: width and format, and description.
 COLUMNS = {
-    "precision": (None, "<9", "precision of the arithmetic"),
-    "pad": ("pix", ">4", "least unobserved pixels round the images"),
-    "iterations": (None, ">10", "iterations done"),
-    "ms": ("ms", ">8.3g", "time of an iteration, mean over the run from its second one on"),
-    "seconds": ("s", ">8.3g", "time of all iterations"),
-    "deviation": (None, ">9.1e", "deviation of the extended source from that in double precision"),
-    "error": (None, ">8.2%", "error of the extended source against the truth of the scene"),
+    "precision": ("<9", "precision of the arithmetic"),
+    "pad": (">4", "least unobserved pixels round the images"),
+    "iterations": (">10", "iterations done"),
+    "ms": (">8.3g", "time of an iteration, mean over the run from its second one on"),
+    "seconds": (">8.3g", "time of all iterations"),
+    "deviation": (">9.1e", "deviation of the extended source from that in double precision"),
+    "error": (">8.2%", "error of the extended source against the truth of the scene"),
 }
 
 
@@ -51,15 +43,12 @@ class Case(NamedTuple):
     stars : sequence of (x, y)
         Positions in pixels, 0-based. The 24 rows around the first count, where they fit in the
         image, else all rows.
-    inputs : list of str
-        The scene or the files, for the record.
     truth : ndarray of float64, shape (ny, nx), optional
         The true extended source, electrons per pixel.
     """
 
     observation: Observation
     stars: Sequence[tuple[float, float]]
-    inputs: Sequence[str]
     truth: Array | None = None
 
     @property
@@ -77,27 +66,20 @@ def simulated_case(size: int) -> Case:
     made = simulate(hh34(size))
     background, read_noise = made.background, made.read_noise
     observation = Observation(made.images, made.psfs, background=background, read_noise=read_noise)
-    return Case(observation, made.stars, [f"hh34, {size} x {size}"], made.extended)
+    return Case(observation, made.stars, made.extended)
 
 
-def check(n_iter: int, accuracy: float, stem: str | None, overwrite: bool) -> None:
+def check(n_iter: int, accuracy: float) -> None:
     """Check the parameters of `run` before any work is done.
 
     Raises
     ------
     InputError
-        `n_iter` is less than 8, `accuracy` is not positive and finite, or `stem` names no file.
-    FileError
-        A file exists and must not be overwritten, or cannot be written.
+        `n_iter` is less than 8, or `accuracy` is not positive and finite.
     """
     whole("n_iter", n_iter, PARTS[0])
     if not (math.isfinite(accuracy) and accuracy > 0):
         raise InputError(f"`accuracy` must be positive and finite; {accuracy} was given")
-    if stem is not None:
-        if not os.path.basename(stem):
-            raise InputError(f"the output {stem!r} names no file; give a path without its ending")
-        for ending in (".ecsv", ".png"):
-            atomic.check_output(stem + ending, overwrite)
 
 
 def run(
@@ -105,11 +87,9 @@ def run(
     n_iter: int = 400,
     accuracy: float = 1e-3,
     device: str | None = None,
-    stem: str | None = None,
-    overwrite: bool = False,
     progress: bool = False,
 ) -> Iterator[str]:
-    """Compare settings, say which to take, and write a table and a figure.
+    """Compare settings, and say which to take.
 
     Parameters
     ----------
@@ -117,10 +97,6 @@ def run(
         As for `compare`.
     accuracy : float
         Deviation that the advice may have, positive.
-    stem : str, optional
-        Path without its ending of the files ``.ecsv`` and ``.png``.
-    overwrite : bool, optional
-        Whether they may be replaced.
 
     Yields
     ------
@@ -131,8 +107,6 @@ def run(
     ------
     InputError, DeviceError
         As for `compare`.
-    FileError
-        A file cannot be written.
     """
     name = describe(choose(device).device)
     measure = "all rows" if case.rows == slice(None) else "24 rows around the star"
@@ -140,14 +114,10 @@ def run(
     table: list[dict[str, Any]] = []
     for row in compare(case, n_iter, device, progress):
         if not table:
-            yield " ".join(format(key, COLUMNS[key][1].split(".")[0]) for key in row)
+            yield " ".join(format(key, COLUMNS[key][0].split(".")[0]) for key in row)
         table.append(row)
-        yield " ".join(format(value, COLUMNS[key][1]) for key, value in row.items())
-    yield from (f"{key}: {COLUMNS[key][2]}" for key in list(table[0])[3:])
-    if stem is not None:
-        meta = {"version": __version__, "device": name, "measure": measure, "n_iter": n_iter}
-        meta |= {"inputs": list(case.inputs), "stars": [list(star) for star in case.stars]}
-        yield from _write(table, meta, stem, overwrite)
+        yield " ".join(format(value, COLUMNS[key][0]) for key, value in row.items())
+    yield from (f"{key}: {COLUMNS[key][1]}" for key in list(table[0])[3:])
     yield advice(table, accuracy)
 
 
@@ -271,27 +241,3 @@ def advice(table: Sequence[dict[str, Any]], accuracy: float) -> str:
         f"{best['iterations']} iterations: {best['seconds']:.2g} s, "
         f"deviation {best['deviation']:.1e}"
     )
-
-
-def _write(
-    rows: list[dict[str, Any]], meta: dict[str, Any], stem: str, overwrite: bool
-) -> Iterator[str]:
-    table = Table(rows, meta=meta)
-    for key in table.colnames:
-        table[key].unit, _, table[key].description = COLUMNS[key]
-    text = io.StringIO()
-    table.write(text, format="ascii.ecsv")
-    atomic.write_text(f"{stem}.ecsv", text.getvalue(), overwrite)
-    yield f"written to {stem}.ecsv"
-    try:
-        check_matplotlib()
-    except LnoclError as error:
-        yield f"no picture: {error}"
-        return
-    curves = {}
-    for part in table.group_by(["pad", "precision"]).groups:
-        pad = f"pad {part['pad'][0]}" if part["pad"][0] else "no padding"
-        name = f"{part['precision'][0]}, {pad}"
-        curves[name] = np.array(part["seconds"]), np.array(part["deviation"])
-    save_figure(draw_costs(curves, meta["measure"]), f"{stem}.png", overwrite)
-    yield f"drew {stem}.png"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator
 from dataclasses import replace
 
@@ -12,6 +11,7 @@ from lnocl.io.saved_results import read_result
 from lnocl.plotting.beside import draw_beside
 from lnocl.plotting.figure import check_matplotlib
 from lnocl.studies.figures import save, view_of
+from lnocl.studies.files import path_in
 
 SCENE = "hh34"
 # The paper's iteration. At 256 x 256 and seed 0, rho'' of MC-RL is 6.6 % at mu 0, 1e-8 and 3e-8,
@@ -35,7 +35,7 @@ def commands(folder: str, words: list[str]) -> Iterator[list[str]]:
     for method, mu in METHODS.items():
         star = [] if method == "RLM" else words[at : at + 2]
         more = ["--mu", mu, "--n-iter", str(N_ITER), *PAPER, "--residuals"]
-        yield [*words[:at], *star, *words[at + 2 : -1], _path(folder, method), *more]
+        yield [*words[:at], *star, *words[at + 2 : -1], path_in(folder, method.lower()), *more]
 
 
 def compare(folder: str, overwrite: bool) -> Iterator[str]:
@@ -46,8 +46,8 @@ def compare(folder: str, overwrite: bool) -> Iterator[str]:
     FileError
         A file of the folder cannot be read, or the picture written.
     """
-    truth = read_result(_path(folder, "truth"))
-    found = {method: read_result(_path(folder, method)) for method in METHODS}
+    truth = read_result(path_in(folder, "truth"))
+    found = {method: read_result(path_in(folder, method.lower())) for method in METHODS}
     ((x, y),) = truth.stars
     star = round(x), round(y)
     rows = metrics.star_rows(star, truth.extended.shape)
@@ -81,7 +81,3 @@ def compare(folder: str, overwrite: bool) -> Iterator[str]:
     }
     views = {name: replace(view, extended=each) for name, each in shown.items()}
     yield save(folder, "demo", draw_beside(views), overwrite)
-
-
-def _path(folder: str, name: str) -> str:
-    return os.path.join(folder, f"{name.lower()}.fits")

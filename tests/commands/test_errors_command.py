@@ -13,7 +13,7 @@ from astropy.io import fits
 from commandline import one_complaint
 
 import lnocl
-from lnocl.commands import bootstrap, cli
+from lnocl.commands import cli, errors
 from lnocl.commands.again import Again
 from lnocl.plotting.profiles import draw_bands
 
@@ -86,7 +86,7 @@ def test_errors_are_added_to_the_file(words, capsys):
 
 @pytest.mark.usefixtures("result")
 def test_regions_are_said_before_stars_and_all_of_them(capsys, monkeypatch):
-    monkeypatch.setattr("lnocl.commands.bootstrap.MAX_LISTED", 2)
+    monkeypatch.setattr("lnocl.commands.errors.MAX_LISTED", 2)
     assert cli.main([*ERRORS, "10"]) == 0
     first, *lines = capsys.readouterr().out.splitlines()
     assert first.startswith("errors by 10 replicas")
@@ -295,7 +295,7 @@ def test_replicas_of_another_command_meanwhile_are_kept(monkeypatch, capsys):
         Path("out.fits").rename(f"{name}.fits")
         Path("out.fits").write_bytes(Path(f"{name}.fits").read_bytes())
     assert cli.main([*ERRORS, "10", "--overwrite", "--quiet"]) == 0
-    before, write = Path("out.fits").read_bytes(), bootstrap._write
+    before, write = Path("out.fits").read_bytes(), errors._write
     for name, status in (("more", 0), ("other", 1)):
         Path("out.fits").write_bytes(before)
         there = Path(f"{name}.fits").read_bytes()
@@ -304,7 +304,7 @@ def test_replicas_of_another_command_meanwhile_are_kept(monkeypatch, capsys):
             Path("out.fits").write_bytes(there)
             write(*given)
 
-        monkeypatch.setattr(bootstrap, "_write", others_first)
+        monkeypatch.setattr(errors, "_write", others_first)
         assert cli.main([*ERRORS, "11", "--quiet"]) == status
         assert Path("out.fits").read_bytes() == there
     assert "out.fits has got replicas of another --seed or of other" in capsys.readouterr().err

@@ -1,9 +1,12 @@
 """Levels of the background that are fitted with a reconstruction."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
 import lnocl
+from lnocl.runs.outcome import Outcome
 
 N = 64
 Y, X = np.indices((N, N), float)
@@ -63,3 +66,12 @@ def test_the_level_is_told_with_its_error(log):
     reconstruct(0, LEVEL, 1.0)
     (line,) = [each for each in log.messages if "fitted with the rest" in each]
     assert line.startswith("image 0: background 8")
+
+
+def test_levels_are_said_without_the_read_noise_that_is_in_them():
+    observed = {"background": np.full((1, 1, 1), 29.0), "read_noise": np.full((1, 1, 1), 3.0)}
+    scene = SimpleNamespace(observation=SimpleNamespace(**observed))
+    levels = SimpleNamespace(errors=np.array([[0.25]]))
+    outcome = SimpleNamespace(levels=levels, has_levels=True, scene=scene)
+    (line,) = Outcome.levels_in_words(outcome)
+    assert line.startswith("`images[0]`: background 20 +- 0.25 electrons per pixel")

@@ -317,3 +317,18 @@ def test_amounts_beside_a_finer_sky():
     assert (abs(result.halo_fluxes - AMOUNTS) <= 3.0 * result.halo_flux_errors).all()
     flux, error = result.extended_flux
     assert abs(flux - halo_scenes.BLOB) <= 4 * error
+
+
+@pytest.mark.parametrize("n", [1, 2])
+def test_halos_of_images_of_several_shapes_have_their_shapes(n):
+    shapes = [(12, 14), (9, 11)]
+    rng = np.random.default_rng(2)
+    halos = [[rng.uniform(1, 2, shape) for shape in shapes] for _ in range(n)]
+    images = [np.full(shape, 9.0) for shape in shapes]
+    known = {"psfs": np.ones((3, 3)), "transforms": [np.eye(2, 3)] * 2}
+    found = lnocl.Observation(images, halos=halos if n > 1 else halos[0], **known).halos
+    for halo, given in zip(found, halos, strict=True):
+        np.testing.assert_allclose(halo[1, :9, :11], given[1] / given[1].sum())
+        assert halo[1].sum() == pytest.approx(1.0)
+    with pytest.raises(lnocl.InputError, match=r"halo 1 has shape .*; give each map"):
+        lnocl.Observation(images, halos=[halos[0][0], halos[0][1][:5]], **known)

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 import turned_scenes as scenes_turned
 from scenes import FEWER_ENGINES, NUMPY_FIRST, make_psfs, paper, same, worst
-from turned_scenes import FLUXES, GRID, NX, NY, STARS, observation, psfs
+from scipy.ndimage import gaussian_filter
+from turned_scenes import ANGLES, FLUXES, GRID, NX, NY, STARS, observation, psfs
 
 import lnocl
 from lnocl.engines.opencl import OpenCLEngine
@@ -95,12 +96,17 @@ def test_model_and_its_adjoint(scene):
     assert abs(one - other) <= 1e-14 * size
 
 
-def split_gradient(given, n_iter):
-    """Return extended source and star fluxes of the paper's iteration on the matrix."""
-    maps = given.transforms
+def split_gradient(given, n_iter, maps=None, step=1):
+    """Return extended source and star fluxes of the paper's iteration on the matrix.
+
+    The images may have every second pixel alone, and `maps` those of all.
+    """
+    maps = given.transforms if maps is None else maps
     matrix = np.hstack([scenes_turned.matrix(maps), scenes_turned.star_columns(maps)])
+    matrix = step**2 * matrix.reshape(3, NY, NX, -1)[:, ::step, ::step]
+    matrix = matrix.reshape(given.images.size, -1)
     weights, images = (~given.mask).ravel().astype(float), given.images.ravel()
-    background = np.tile(scenes_turned.background().ravel(), 3)
+    background = np.tile(scenes_turned.background()[::step, ::step].ravel(), 3)
     start = np.full(GRID, 8.0)
     total = matrix.T @ weights
     is_observed = total[:-2] >= 0.01 * total[:-2].max()
@@ -119,6 +125,19 @@ def test_iterations_are_those_of_the_matrix(engine, maps):
     extended, fluxes = split_gradient(given, 30)
     assert worst(result.extended, extended) <= 3e-3
     assert worst(result.star_fluxes, fluxes) <= 4e-4  # measured 1.4e-4
+
+
+@pytest.mark.parametrize("engine", FEWER_ENGINES)
+def test_iterations_of_a_finer_sky_are_those_of_the_matrix(engine, maps):
+    """Images have every second pixel of those before, along each axis."""
+    given = scenes_turned.finer_observation(maps)
+    assert Scene(given).grid == GRID
+    stars = (STARS - 0.5) / 2
+    result = paper(given, stars, n_iter=30, **START, **engine)
+    before = scenes_turned.transforms() if maps is None else maps
+    extended, fluxes = split_gradient(given, 30, before, 2)
+    assert worst(result.extended, extended) <= 3e-3
+    assert worst(result.star_fluxes, fluxes) <= 4e-4
 
 
 @functools.cache
@@ -458,7 +477,6 @@ def test_all_goes_wrong_in_one_line():
     sheared[0, 0, 1] += 0.01
     cases = [
         ({"offsets": np.zeros((3, 2))}, "`transforms` are not taken beside offsets"),
-        ({"oversample": 2}, "`transforms` are not taken beside oversample"),
         ({"transforms": maps[:2]}, "`transforms` has shape (2, 2, 3); give 2 x 3 numbers"),
         ({"transforms": maps * np.nan}, "`transforms` must be finite"),
         ({"transforms": maps * 1.01}, "`transforms[0]` is for pixels of 0.9901 of the sky's"),
@@ -518,3 +536,106 @@ def test_a_flat_sky_is_as_bright_as_pixels_are_large():
     assert scene.level == pytest.approx(9.0, rel=1e-12)
     result = paper(scene.observation, n_iter=20, engine="numpy")
     assert worst(result.models()[2][~scene.observation.mask[2]], 9.0 * 1.7**2 + 4.0) <= 0.021
+
+
+NODES = [(0.0, 0.0), (NX - 1.0, 0.0), (0.0, NY - 1.0), (NX - 1.0, NY - 1.0)]
+
+
+def fields():
+    """Return PSFs that vary over each image: those of another image in its last column."""
+    one, other = psfs(), np.roll(psfs(), 1, axis=0)
+    return [lnocl.PsfField([a, b, a, b], NODES) for a, b in zip(one, other, strict=True)]
+
+
+QUARTERS = ANGLES + np.array([90.0, 180.0, -90.0])
+
+
+@pytest.mark.parametrize("angles", [ANGLES, QUARTERS], ids=["turned", "quarter turns"])
+def test_stars_have_the_psf_of_their_place_in_each_image(angles):
+    maps = scenes_turned.transforms(angles)
+    maps[1, 0] *= -1.0  # a flip
+    maps[1, 0, 2] += NX - 1.0
+    scene = Scene(observation(maps, psfs=fields()), STARS)
+    y, x = np.indices((NY, NX))
+    for s, star in enumerate(STARS):
+        images = np.array([scene.star_image(j, s) for j in range(3)])
+        height, width = scene.observation.shape
+        found = scene.observation.as_given(images[:, :height, :width])
+        for j, each in enumerate(maps):
+            at = each[:, :2] @ star + each[:, 2]
+            share = np.clip(at[0] / (NX - 1), 0.0, 1.0)
+            one, other = (
+                scenes_turned.psf(x - at[0], y - at[1], scenes_turned.COVARIANCES[k])
+                for k in (j, j - 1)
+            )
+            expected = (1.0 - share) * one + share * other
+            assert worst(found[j], expected) <= 3e-4, (j, s)
+
+
+@pytest.mark.parametrize("angles", [ANGLES, QUARTERS], ids=["turned", "quarter turns"])
+def test_the_sky_has_the_psfs_of_the_middle_of_each_image(angles):
+    maps = scenes_turned.transforms(angles)
+    middle = np.array([each.at((NX - 1) / 2, (NY - 1) / 2) for each in fields()])
+    scenes = [Scene(observation(maps, psfs=each), STARS) for each in (fields(), middle)]
+    scenes.append(scenes[0].seen_through(scenes[0].observation.psfs_over_images))
+    for j in range(3):
+        expected = scenes[1].psf(j)
+        for scene in scenes[::2]:
+            np.testing.assert_allclose(scene.psf(j), expected, atol=1e-11)
+
+
+def test_one_field_is_not_for_pixels_of_several_sizes():
+    with pytest.raises(lnocl.LnoclError, match="one PSF is given for images whose pixels are 1"):
+        observation(scenes_turned.scaled(), psfs=fields()[0])
+
+
+@pytest.mark.exhaustive
+@pytest.mark.filterwarnings("ignore::lnocl.LnoclWarning")
+@pytest.mark.parametrize(("oversample", "allowed"), [(2, 4e-5), (4, 2e-5)])
+def test_rolls_with_pixels_as_wide_as_the_psf(oversample, allowed):
+    """Two stars in a ring of Gaussians; all images are known in closed form."""
+    n, middle, q = 64, 31.5, oversample
+    stars, fluxes = [(31.3, 33.8), (33.4, 35.1)], np.array([2e5, 6e3])
+    turns = np.linspace(0, 2 * np.pi, 40, endpoint=False)
+    ring = stars[0] + np.stack([12.0 * np.cos(turns), 7.2 * np.sin(turns)], axis=1)
+    knots = 2000.0 * (1.0 + 0.5 * np.cos(turns))
+    maps = lnocl.rotations([0.0, 22.0, -33.0, 41.0], (middle, middle))
+    maps[:, :, 2] += [(0, 0), (0.37, -0.21), (-0.45, 0.3), (0.18, 0.44)]
+    y, x = np.indices((n, n))
+
+    def seen(x, y, blur=0.0):
+        square = (1.4 / 2.3548) ** 2
+        first = scenes_turned.gaussian(x, y, np.diag([square, 1.2 * square]) + blur * np.eye(2))
+        ghost = scenes_turned.gaussian(x - 0.7, y + 0.5, (2.0 * square + blur) * np.eye(2))
+        return 0.8 * first + 0.2 * ghost
+
+    def images(places, light, blur=0.0):
+        at = np.einsum("jik,nk->jni", maps[:, :, :2], places) + maps[:, None, :, 2]
+        sums = [
+            sum(c * seen(x - px, y - py, blur) for c, (px, py) in zip(light, each, strict=True))
+            for each in at
+        ]
+        return np.array(sums)
+
+    of_ring = images(ring, knots, 1.0)
+    v, u = (np.indices((32 * q + 1,) * 2) - 16 * q) / q
+    mean = of_ring + images(stars, fluxes) + 40.0
+    given = lnocl.Observation(
+        np.random.default_rng(4).poisson(mean).astype(float),
+        [seen(u, v)] * 4,
+        background=40.0,
+        transforms=maps,
+        oversample=q,
+        effective_psfs=True,
+    )
+    model = Model(Scene(given, stars))
+    v, u = (np.indices(model.grid) - (q - 1) / 2) / q
+    blobs = (scenes_turned.gaussian(u - px, v - py, np.eye(2)) for px, py in ring)
+    sky = sum(c * blob for c, blob in zip(knots, blobs, strict=True)) / q**2
+    assert worst(model.forward(sky)[:, :n, :n], of_ring) <= allowed
+    if oversample == 2:
+        result = lnocl.deconvolve(given, stars, refine_psfs=(), refine_positions=False)
+        assert (abs(result.star_fluxes - fluxes) < 4 * result.star_flux_errors).all()
+        np.testing.assert_allclose(result.star_fluxes, fluxes, rtol=0.012)
+        smooth = [gaussian_filter(each[: n * q, : n * q], q) for each in (result.extended, sky)]
+        assert np.linalg.norm(smooth[0] - smooth[1]) <= 0.03 * np.linalg.norm(smooth[1])

@@ -8,13 +8,10 @@ from result_views import make_view
 
 from lnocl.errors import LnoclError
 from lnocl.plotting.beside import draw_beside
-from lnocl.plotting.curves import draw_costs
 from lnocl.plotting.profiles import draw_bands
 from lnocl.plotting.psf import PSF_FLOOR, draw_star_psf
 
 pytest.importorskip("matplotlib")
-
-COSTS = np.array([1.0, 4.0]), np.array([0.1, 0.0])
 
 
 def lines(axis):
@@ -52,21 +49,15 @@ def test_results_without_stars_or_light_are_shown_whole():
     assert len(shown) == 2
 
 
-def test_costs_are_shown_but_for_the_reference():
-    (axis,) = draw_costs({"double": COSTS}, "all rows").axes
-    np.testing.assert_array_equal(lines(axis)["double"], [[1.0], [0.1]])
-    assert (axis.get_xscale(), axis.get_yscale()) == ("log", "log")
-
-
 def test_pyplot_is_left_alone():
-    draw_costs({"double": COSTS}, "all rows")
+    draw_beside(views())
     assert "matplotlib.pyplot" not in sys.modules
 
 
 def test_without_matplotlib_one_line_says_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "matplotlib", None)
     with pytest.raises(LnoclError, match=r"pip install matplotlib$"):
-        draw_costs({"double": COSTS}, "all rows")
+        draw_beside(views())
 
 
 @pytest.mark.parametrize("angle", [0.0, 30.0])

@@ -12,7 +12,7 @@ from lnocl.io.saved_results import read_result
 from lnocl.plotting.light_curves import light_curves
 from lnocl.plotting.result import (
     MAX_SIGMA,
-    MAX_ZOOMS,
+    MOST_STARS,
     Region,
     draw_result,
     image_limits,
@@ -117,7 +117,7 @@ def test_of_many_stars_the_brightest_are_enlarged():
     figure = draw_result(view)
     titles = [title for title, _ in panels(figure) if title.startswith("image")]
     assert titles[1:] == [f"image, star {s}" for s in (1, 2, 3, 4, 5, 9)]
-    assert len(titles) == 1 + MAX_ZOOMS
+    assert len(titles) == 1 + MOST_STARS
     assert "6 brightest of 9 stars" in figure.subfigs[0].get_suptitle()
 
 

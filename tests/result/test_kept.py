@@ -34,12 +34,19 @@ def psfs(n):
 
 
 def mended():
-    """PSFs are refined, held-out counts choose, a prior holds the stars, the image is flipped."""
+    """PSFs are refined, held-out counts choose, the image is flipped."""
     (psf,) = psfs(1)
     seen = images(psf, blur=1.0)[:, ::-1], psf[:, ::-1]
     options = {"stop": "held-out", "n_iter": 99, "refine_psfs": ["jitter"]}
     flip = {"transforms": [[[-1.0, 0.0, NX - 1], [0.0, 1.0, 0.0]]]}
     return lnocl.Observation(*seen, background=LEVEL, **flip), STARS, options
+
+
+def held():
+    """PSFs are right, so that a prior holds the stars while held-out counts choose."""
+    (psf,) = psfs(1)
+    observation = lnocl.Observation(images(psf), psf, background=LEVEL, psf_centre="given")
+    return observation, np.floor(STARS), {"stop": "held-out", "n_iter": 300}
 
 
 def levelled():
@@ -59,7 +66,7 @@ def turned():
     return observation, turned_scenes.STARS, {"stop": None, "n_iter": 4, "smoothing": 0.1}
 
 
-CASES = [mended, levelled, pytest.param(turned, marks=pytest.mark.exhaustive)]
+CASES = [mended, held, levelled, pytest.param(turned, marks=pytest.mark.exhaustive)]
 
 
 def again_from(parts, given):
@@ -72,6 +79,7 @@ def case(request, tmp_path_factory):
     path = str(tmp_path_factory.mktemp("kept") / "out.fits")
     observation, stars, options = request.param()
     outcome = lnocl.deconvolve(observation, stars, **{**RUN, **options})._outcome
+    assert bool(outcome.scene.penalty.stars) == (request.param is held)
     parts = to_parts(outcome, observation)
     columns = [Column(name, value[None]) for name, value in parts.items()]
     write_result(path, np.ones((8, 8)), [], [], {"ESTIMATE": columns})

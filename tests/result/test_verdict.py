@@ -10,7 +10,7 @@ from scenes import make_psfs
 import lnocl
 from lnocl.commands import cli
 from lnocl.residuals import Fit, StarResiduals
-from lnocl.result.verdict import faults
+from lnocl.result.verdict import _elsewhere, faults
 
 N, STAR, LEVEL = 48, (21, 26), 20.0
 Y, X = np.indices((N, N))
@@ -68,6 +68,12 @@ def test_a_star_without_light_is_said_to_have_none():
         and "lies at (18, 30)" in each
         for each in warned
     )
+
+
+def test_light_beside_a_place_without_any_is_named_in_pixels_of_the_images():
+    sky = np.zeros((64, 80))
+    sky[36:38, 43] = 3.0, 9.0
+    assert "pixels lies at (21.25, 18.25): give" in _elsewhere(sky, np.array([20.0, 21.0]), 2)
 
 
 def test_a_star_that_moved_as_far_as_stars_may_is_named_first():

@@ -10,7 +10,7 @@ from scipy.ndimage import gaussian_filter
 from scipy.stats import t
 
 import lnocl
-from lnocl.runs import bootstrap
+from lnocl.runs import bootstrap, quantities
 from lnocl.runs.bootstrap import Bootstrap, Quantity
 from lnocl.runs.repeated import Repeated
 from lnocl.runs.replicas import Replicas
@@ -309,8 +309,8 @@ def test_regions_whose_errors_may_not_hold_are_named():
     x, y = np.round(outcome.scene.stars[0]).astype(int)
     side = int(np.ceil(width))
     named = {
-        bootstrap.BELOW: Aperture("tiny", 20, 20, np.ones((1, 1))),
-        bootstrap.UNDER: Aperture("core", y - side // 2, x - side // 2, np.ones((side, side))),
+        quantities.BELOW: Aperture("tiny", 20, 20, np.ones((1, 1))),
+        quantities.UNDER: Aperture("core", y - side // 2, x - side // 2, np.ones((side, side))),
         "": Aperture("wide", 2, 2, np.ones((20, 20))),
     }
     found = bootstrap.without_replicas(outcome, list(named.values()), 0)
@@ -369,7 +369,7 @@ def test_regions_that_no_image_has_seen_are_named():
     )._outcome
     parts = [Aperture("dark", 30, 4, np.ones((9, 9))), Aperture("lit", 30, 40, np.ones((9, 9)))]
     found = bootstrap.without_replicas(outcome, parts, 0)
-    assert [each.note for each in found.quantities] == [bootstrap.UNSEEN, ""]
+    assert [each.note for each in found.quantities] == [quantities.UNSEEN, ""]
 
 
 def test_rates_are_called_rates():

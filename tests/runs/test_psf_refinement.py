@@ -227,6 +227,19 @@ def test_stars_far_apart_are_looked_at_where_most_are(monkeypatch):
     np.testing.assert_array_equal(first, (0, 0))
 
 
+def test_psfs_of_a_window_vary_as_those_of_the_images(monkeypatch):
+    monkeypatch.setattr("lnocl.runs.guarded_runs.WINDOW", 32)
+    widths = 3.0 + np.arange(4) / 2.0
+    psfs = [psf[20:45, 20:45] / psf[20:45, 20:45].sum() for psf in map(moffat, widths)]
+    field = lnocl.PsfField(psfs, [(0, 0), (119, 0), (0, 99), (119, 99)])
+    observation, stars = lnocl.Observation(np.ones((1, 100, 120)), field), np.array([(96.3, 41.7)])
+    setup = Setup(observation, stars, 0, "sgp", "single", "numpy", None)
+    runs = guarded_runs.GuardedRuns(setup)
+    (found,) = runs.seen_through(observation.psf_fields).psf_fields
+    expected = observation.psf_fields[0].at(*stars[0])
+    np.testing.assert_allclose(found.at(*runs.stars[0]), expected, rtol=1e-12)
+
+
 @pytest.mark.parametrize("name", ["halos", "mask"])
 def test_images_stay_whole_where_a_window_holds_no_halo_or_no_good_pixel(name):
     far = np.zeros((100, 120))

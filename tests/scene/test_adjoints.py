@@ -39,10 +39,11 @@ OFFSETS = np.array([(0.0, 0.0), (1.4, -2.7), (-3.0, 0.3)])
 SECONDS = EXPOSURE[:, None, None] * RNG.uniform(0.5, 2.0, SHAPE)
 MASK = RNG.random((P, *SHAPE)) < 0.03
 SMOOTH = make_smooth_psfs(P, (13, 15))
+BROAD = make_smooth_psfs(P, (18, 17))
 
 
-def turned(maps, transmission=None):
-    given = {"psfs": SMOOTH, "psf_centre": "given", "transmission": transmission}
+def turned(maps, transmission=None, psfs=SMOOTH, **changes):
+    given = {"psfs": psfs, "psf_centre": "given", "transmission": transmission, **changes}
     return turned_scenes.observation(maps, **given)
 
 
@@ -66,6 +67,10 @@ KINDS = {
     ),
     "turned": lambda: turned(turned_scenes.transforms()),
     "scaled": lambda: turned(turned_scenes.scaled()),
+    "turned, finer": lambda: turned(turned_scenes.transforms(), psfs=BROAD, oversample=2),
+    "scaled, effective": lambda: turned(
+        turned_scenes.scaled(), psfs=BROAD, oversample=2, effective_psfs=True
+    ),
     "dimmed": lambda: observe(SMOOTH, offsets=OFFSETS, mask=MASK, transmission=shares(*SHAPE)),
     "dimmed, finer": lambda: observe(
         make_smooth_psfs(P, (18, 17)), offsets=OFFSETS, oversample=2, transmission=shares(80, 112)
@@ -118,14 +123,16 @@ def test_flat_and_shared_images(kind):
     model = Model(a_scene(kind))
     x, factors = abs(noise(*model.grid)), abs(noise(2, P, seed=5))
     # What is turned is flat where no edge is near.
-    inside = np.s_[:, 8:20, 8:20] if model.scene.rotations else np.s_[:]
+    inside = np.s_[:, 7:13, 8:20] if model.scene.rotations else np.s_[:]
     allowed = 1e-3 if model.scene.rotations else 1e-12
     flat = np.broadcast_to(2.0, model.grid)
     expected = model.forward(x + flat) - model.forward(x)
     np.testing.assert_allclose(model.forward(flat)[inside], expected[inside], rtol=allowed)
+    of_ones = [np.broadcast_to(each.of_ones(), model.shape[1:]) for each in model.cameras]
+    np.testing.assert_allclose(2.0 * np.array(of_ones)[inside], expected[inside], rtol=allowed)
     ny, nx = model.shape[1:]
     # Samples of an effective PSF a pixel apart may sum to another number.
-    ones = [] if kind == "effective" else [np.broadcast_to(1.3, (ny, nx))]
+    ones = [] if kind.endswith("effective") else [np.broadcast_to(1.3, (ny, nx))]
     for one in (abs(noise(ny, nx, seed=6)), *ones):
         shared = model.adjoints(np.broadcast_to(one, model.shape), factors)
         apart = model.adjoints([one + np.zeros((ny, nx)) for _ in range(P)], factors)
@@ -245,7 +252,7 @@ def test_the_sky_round_a_star(kind, monkeypatch):
         np.testing.assert_allclose(responses[j, :ny, :nx][is_seen], flat[is_seen], rtol=allowed)
 
 
-@pytest.mark.parametrize("kind", ["apart", "moved", "finer", "turned", "scaled"])
+@pytest.mark.parametrize("kind", ["apart", "moved", "finer", "turned", "scaled", "turned, finer"])
 def test_errors_of_the_pixels_of_psfs(kind):
     scene = a_scene(kind)
     psfs = scene.observation.psfs

@@ -702,7 +702,6 @@ def test_replace_makes_what_an_observation_of_these_is(name, before):
         ({}, {"turns": np.zeros((2, 2, 2))}, "turns cannot be replaced"),
         ({}, {"_is_checked": True}, "_is_checked cannot be replaced"),
         ({}, {"images": np.ones((2, 8, 8))}, "mask has shape (2, 8, 9); the images have (2, 8, 8)"),
-        ({"transforms": TURNED}, {"oversample": 2}, "transforms are not taken beside oversample"),
         ({"transforms": TURNED}, {"offsets": np.eye(2)}, "transforms are not taken beside offsets"),
         (
             {"mask": MASK_89, "exposure": np.ones((8, 9))},

@@ -145,3 +145,17 @@ def test_a_common_shift_is_taken_out():
     (alone, _), none = found.without_common_shift(with_values(found, values[:1, 2:]))
     np.testing.assert_array_equal(alone, values[:1, 2:])
     np.testing.assert_array_equal(none, (0.0, 0.0))
+
+
+@pytest.mark.parametrize("angles", [(0.0, 0.0, 0.0), (0.0, 70.0, 200.0)])
+def test_what_a_shift_of_the_sky_does_to_turned_images_is_none_of_their_psfs(angles):
+    """The mean along the images' axes was taken for it, and moved stars where they are not."""
+    maps = lnocl.rotations(angles, (7.5, 7.5))
+    observation = lnocl.Observation(np.ones((3, 16, 16)), np.ones((5, 5)), transforms=maps)
+    families = PsfFamilies(("shift", "jitter"), observation)
+    shift, own, jitter = np.array([0.3, -0.2]), 0.1 * np.eye(3, 2), np.arange(9.0).reshape(3, 3)
+    own -= maps[:, :, :2] @ np.mean(maps[:, :, :2].swapaxes(1, 2) @ own[:, :, None], axis=0)[:, 0]
+    values = np.hstack([own + maps[:, :, :2] @ shift, jitter])
+    found, common = families.without_common_shift(families.first()._replace(values=values))
+    np.testing.assert_allclose(common, shift, rtol=1e-12)
+    np.testing.assert_allclose(found.values, np.hstack([own, jitter]), atol=1e-12)

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from scenes import worst
 from turned_scenes import gaussian
 
+import lnocl
 from lnocl.scene.rotation import Rotation, turned_psf
 from lnocl.scene.transforms import rotation
 
@@ -141,3 +142,12 @@ def test_a_psf_is_turned_about_its_centre(degrees, shape, scale):
     expected = gaussian(*np.einsum("ij,jyx->iyx", turn, np.array([u, v])), covariance) / scale**2
     assert worst(found, expected) <= 2e-5  # the PSF is cut off at its edges
     assert found.sum() == pytest.approx(psf.sum(), rel=1e-9)
+
+
+def test_images_upright_have_the_maps_of_the_images_as_given():
+    quarter = np.array([[0.0, -1.0, 31.5], [1.0, 0.0, 2.25]])
+    back = np.array([[0.0, 1.0, -2.5], [-1.0, 0.0, 40.0]])
+    maps = np.array([np.eye(2, 3), quarter, back])
+    observation = lnocl.Observation(np.ones((3, 30, 44)), np.ones((3, 3)), transforms=maps)
+    assert observation.upright().geometry.orientations
+    np.testing.assert_allclose(observation.upright().transforms, maps, atol=1e-12)

@@ -73,6 +73,15 @@ def test_a_star_has_its_own_psf_in_the_axes_of_each_image_and_all_else_the_commo
         assert shown(scene, j, 0).sum() == pytest.approx(gain, rel=1e-6)
 
 
+def test_two_stars_have_the_psfs_of_their_places():
+    """In whatever order they are given."""
+    own = np.array([OWN, 3.0 * OWN[::-1, ::-1]])
+    scene = Scene(observe(star_psfs=own, star_places=[PLANET, STAR]), [STAR, (9.0, 30.0), PLANET])
+    for j in range(2):
+        np.testing.assert_allclose(shown(scene, j, 0), placed(own[1, j], STAR), atol=1e-15)
+        np.testing.assert_allclose(shown(scene, j, 2), placed(own[0, j], PLANET), atol=1e-15)
+
+
 def test_the_models_are_sums_of_both_psfs():
     obs = observe(background=5.0, exposure=[1.0, 3.0])
     sky = np.random.default_rng(2).uniform(1.0, 2.0, (N, N))
@@ -130,10 +139,16 @@ def test_light_of_a_wide_psf_does_not_come_in_at_the_other_edge():
     np.testing.assert_allclose(shown(scene, 0, 0), placed(wide, (45.0, 3.0)), atol=1e-18)
 
 
-@pytest.mark.parametrize("is_turned", [False, True])
-def test_the_psf_on_the_sky_is_turned_back_as_the_common_one_is(is_turned):
-    given = {"transforms": lnocl.rotations([0.0, 25.0], (20.0, 20.0))} if is_turned else {}
-    given |= {"psfs": whole(make_psfs(2, (23, 23)))}
+TURNS = {
+    "upright": {},
+    "turned": {"transforms": lnocl.rotations([0.0, 25.0], (20.0, 20.0))},
+    "scaled": {"transforms": QUARTER[:1] * np.reshape([1.0, 0.7], (2, 1, 1))},
+}
+
+
+@pytest.mark.parametrize("turn", TURNS)
+def test_the_psf_on_the_sky_is_turned_back_as_the_common_one_is(turn):
+    given = TURNS[turn] | {"psfs": whole(make_psfs(2, (23, 23)))}
     own = Scene(observe(**given, star_psfs=0.1 * given["psfs"]), [PLANET, STAR])
     common = Scene(observe(**given, star_psfs=None, star_places=None), [PLANET, STAR])
     for j in range(2):

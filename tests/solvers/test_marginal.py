@@ -99,6 +99,9 @@ def test_no_flux_is_negative_and_none_comes_back():
         _, found = after_step(scene, 0.9 * HOST, np.array([held, 3e4]))
         assert found[0] >= 0.0
     assert found[0] == 0.0
+    scene = a_scene(fluxes=np.array([-500.0, 3e4]))  # a hole in the light of the host
+    _, found = after_step(scene, HOST, np.array([300.0, 3e4]))
+    assert found[0] == 0.0
 
 
 class TestByDefault:

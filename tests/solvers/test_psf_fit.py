@@ -92,6 +92,7 @@ WIDE /= WIDE.sum(axis=(1, 2), keepdims=True)
 TURNED = lnocl.rotations([0.0, 25.0], centre=(7.5, 7.5))
 SCALED = np.concatenate([TURNED[:1], TURNED[1:] / 1.25 + [[0, 0, 1.5], [0, 0, 1.5]]])
 NODES = [(0, 0), (15, 0)]
+FIELDS = [lnocl.PsfField([psf, psf[::-1]], NODES) for psf in WIDE]
 IN_FRAMES = {
     "turned": {"transforms": TURNED},
     "scaled": {"transforms": SCALED, "exposure": EXPOSURE},
@@ -99,7 +100,10 @@ IN_FRAMES = {
         "transforms": TURNED,
         "transmission": np.array([np.where(X < 0.0, 0.4, 0.9), np.full((N, N), 0.7)]),
     },
-    "a field": {"psfs": [lnocl.PsfField([psf, psf[::-1]], NODES) for psf in WIDE]},
+    "turned, finer": {"transforms": TURNED, "oversample": 2},
+    "scaled, effective": {"transforms": SCALED, "oversample": 2, "effective_psfs": True},
+    "a field": {"psfs": FIELDS},
+    "a turned field": {"psfs": FIELDS, "transforms": TURNED},
 }
 
 
@@ -125,7 +129,8 @@ def test_slopes_and_pixels_of_images_with_frames_and_psfs_of_their_own(known):
         ("shift", "jitter", "strehl", "modes", "pixels"), scene.observation, 0.1 * WIDE
     )
     k, fluxes, sky = len(family.prior), np.array([3.0, 0.8]), np.zeros(scene.grid)
-    sky[:N, :N] = SKY / 10.0
+    first = (scene.oversample - 1) * N // 2  # in the middle of the images
+    sky[first : first + N, first : first + N] = SKY / 10.0
     start, estimate = family.first(), Estimate.of_scaled(scene, sky, fluxes)
     images = psf_fit._linearise(estimate, family, start.values, Model(scene), True)
 

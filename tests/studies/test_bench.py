@@ -2,13 +2,10 @@
 
 import functools
 import os
-import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
 from astropy.io import fits
-from astropy.table import Table
 from scenes import Recipe, paper
 
 import lnocl
@@ -20,7 +17,7 @@ from lnocl.studies import bench
 pytestmark = pytest.mark.usefixtures("few_screens")
 
 MADE = Recipe((32, 32), n_images=2, n_stars=1, smooth=True, psf_shape=(9, 9)).make()
-CASE = bench.Case(MADE.observation(), MADE.stars, [])
+CASE = bench.Case(MADE.observation(), MADE.stars)
 N_ITER = 8
 ROWS = 16
 
@@ -100,19 +97,19 @@ class TestNumbers:
 
     @pytest.mark.usefixtures("numpy_only")
     def test_a_psf_of_one_pixel_asks_for_no_padding(self):
-        case = bench.Case(MADE.observation(psfs=np.ones((1, 1))), [], [])
+        case = bench.Case(MADE.observation(psfs=np.ones((1, 1))), [])
         assert {row["pad"] for row in bench.compare(case, N_ITER)} == {0}
 
     @pytest.mark.usefixtures("numpy_only")
     def test_a_warning_comes_once(self):
-        case = bench.Case(MADE.observation(psfs=np.ones((1, 65))), [], [])
+        case = bench.Case(MADE.observation(psfs=np.ones((1, 65))), [])
         with pytest.warns(lnocl.LnoclWarning, match="larger than the grid") as caught:
             list(bench.compare(case, N_ITER))
         assert len(caught) == 1
 
     @pytest.mark.usefixtures("numpy_only")
     def test_images_without_light_are_refused(self):
-        dark = bench.Case(lnocl.Observation(np.zeros((8, 8)), np.ones((3, 3))), [], [])
+        dark = bench.Case(lnocl.Observation(np.zeros((8, 8)), np.ones((3, 3))), [])
         with pytest.raises(lnocl.InputError, match="hold no light"):
             list(bench.compare(dark, N_ITER))
 
@@ -164,50 +161,31 @@ class TestAdvice:
 
 @pytest.mark.usefixtures("engine")
 class TestCommand:
-    def test_files(self, table, capsys):
-        assert run(*FILES, *STAR, "-o", "out", "--accuracy", "0.01") == 0
+    def test_rows_are_those_of_the_comparison(self, table, capsys):
+        assert run(*FILES, *STAR, "--accuracy", "0.01") == 0
         captured = capsys.readouterr()
         assert captured.err == ""
-        written = Table.read("out.ecsv")
-        deviations = [row["deviation"] for row in table]
-        np.testing.assert_allclose(written["deviation"], deviations, rtol=1e-6, atol=1e-12)
         lines = captured.out.splitlines()
         rows = [line.split() for line in lines if line.startswith(("double ", "single "))]
-        assert [float(row[5]) for row in rows] == [
-            float(f"{deviation:.1e}") for deviation in written["deviation"]
-        ]
-        assert lines[-1] == bench.advice(list(written), 0.01)
-        assert written.meta["device"] in lines[0]
-        assert written.meta["version"] == lnocl.__version__
-        assert written.meta["inputs"] == ["images.fits", "psfs.fits"]
-        assert written.meta["stars"] == [[9.0, 17.0]]
-        assert Path("out.png").exists() == ("drew out.png" in lines)
+        found = [float(row[5]) for row in rows]
+        expected = [row["deviation"] for row in table]
+        np.testing.assert_allclose(found, expected, rtol=0.06, atol=1e-12)
+        assert lines[-1].startswith("for an accuracy of 0.01: ")
 
     @pytest.mark.usefixtures("numpy_only")
     def test_the_demo_has_a_truth(self, capsys):
-        assert run("--size", "64", "-o", "out") == 0
-        table, made = Table.read("out.ecsv"), simulate(hh34(64))
+        assert run("--size", "64") == 0
+        made = simulate(hh34(64))
         observation = lnocl.Observation(
             made.images, made.psfs, background=made.background, read_noise=made.read_noise
         )
         result = paper(observation, made.stars, n_iter=N_ITER, engine="numpy")
         rows = metrics.star_rows(made.stars[0], made.extended.shape)
         expected = metrics.restoration_error(result.extended, made.extended, rows)
-        assert table["error"][3] == pytest.approx(expected, rel=1e-9)
-        assert f"{expected:.2%}" in capsys.readouterr().out
-        assert set(table["pad"]) == {0, 32}
-
-    def test_without_output_nothing_is_written(self, capsys):
-        before = sorted(os.listdir())
-        assert run(*FILES, *STAR) == 0
-        assert capsys.readouterr().out.splitlines()[-1].startswith("for an accuracy of 0.001: ")
-        assert sorted(os.listdir()) == before
-
-    def test_without_matplotlib_the_table_is_written(self, capsys, monkeypatch):
-        monkeypatch.setitem(sys.modules, "matplotlib", None)
-        assert run(*FILES, *STAR, "-o", "out") == 0
-        assert "no picture: pictures need matplotlib" in capsys.readouterr().out
-        assert (Path("out.ecsv").exists(), Path("out.png").exists()) == (True, False)
+        lines = capsys.readouterr().out.splitlines()
+        rows = [line.split() for line in lines if line.startswith(("double ", "single "))]
+        assert rows[3][-1] == f"{expected:.2%}"
+        assert {row[1] for row in rows} == {"0", "32"}
 
     def test_what_is_interrupted_has_shown_its_complete_runs(self, capsys, monkeypatch):
         calls, deconvolve = [], bench.deconvolve
@@ -219,30 +197,11 @@ class TestCommand:
             return deconvolve(*arguments, **keywords)
 
         monkeypatch.setattr(bench, "deconvolve", stop)
-        assert run(*FILES, *STAR, "-o", "out") == 130
+        assert run(*FILES, *STAR) == 130
         captured = capsys.readouterr()
         assert captured.err == "lnocl: error: interrupted\n"
         rows = [line.split()[0] for line in captured.out.splitlines()[2:]]
         assert rows == 4 * ["double"] + 4 * ["single"]
-        assert not Path("out.ecsv").exists()
-
-    @pytest.mark.parametrize("ending", ["ecsv", "png"])
-    def test_existing_files_are_refused_before_the_work(self, ending, capsys, monkeypatch):
-        monkeypatch.setattr(
-            "lnocl.io.frames.read_frames", lambda *given: pytest.fail("work was begun")
-        )
-        Path(f"out.{ending}").write_text("kept")
-        assert run(*FILES, "-o", "out") == 1
-        captured = capsys.readouterr()
-        assert captured.out == ""
-        assert captured.err.startswith(f"lnocl: error: the output out.{ending} exists")
-        assert captured.err.count("\n") == 1
-        assert Path(f"out.{ending}").read_text() == "kept"
-
-    def test_overwrite_replaces(self):
-        Path("out.ecsv").write_text("old")
-        assert run(*FILES, *STAR, "-o", "out", "--overwrite") == 0
-        assert len(Table.read("out.ecsv")) == ROWS
 
     @pytest.mark.parametrize(
         ("arguments", "message"),
@@ -258,7 +217,6 @@ class TestCommand:
             ([*FILES, "--accuracy", "nan"], "accuracy must be positive and finite; nan"),
             ([*FILES, "--device", "no such"], "fits no OpenCL device"),
             (["--size", "65"], "each side must be even"),
-            (["-o", "there/"], "names no file"),
         ],
     )
     def test_wrong_use_is_one_line(self, arguments, message, capsys):
