@@ -240,8 +240,7 @@ def deconvolve_tiles(
     plan = replace(plan, setup=replace(plan.setup, pad=pad), in_tiles=True)
     prepared = prepare(plan, progress)
     observation, near_stars = prepared.setup.observation, prepared.penalties[0].near_stars
-    cuts = (cut(observation, positions, near_stars, spans) for spans in tiles)
-    observed = [*filter(None, cuts)]
+    observed = [*filter(None, (cut(observation, positions, near_stars, at) for at in tiles))]
     for x, y in np.delete(positions, np.concatenate([each.numbers for each in observed]), axis=0):
         raise InputError(
             f"the star at ({x:g}, {y:g}) lies in a tile that all images mask; leave it out or mend "

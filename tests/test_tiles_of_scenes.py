@@ -149,6 +149,19 @@ def test_stars_of_tiles_have_a_flux_in_each_epoch():
     assert len(found.star_residuals()) == 6
 
 
+@pytest.mark.filterwarnings("error:invalid value")
+def test_an_image_that_a_tile_does_not_see_tells_nothing_of_its_light():
+    counts = np.random.default_rng(0).poisson(20.0, (2, 12, 14))
+    psf_of_all = np.ones((2, 3, 2))
+    bad = np.zeros(counts.shape, bool)
+    bad[1] = True
+    both = lnocl.Observation(counts, psf_of_all, mask=bad)
+    one = lnocl.Observation(counts[:1], psf_of_all[:1])
+    run = RUN | {"n_iter": 3}
+    fluxes = [lnocl.deconvolve(each, **run).extended_flux for each in (both, one)]
+    np.testing.assert_allclose(fluxes[0], fluxes[1], rtol=1e-6)
+
+
 @pytest.mark.exhaustive
 @pytest.mark.parametrize("kind", KINDS)
 def test_tiles_are_the_whole_and_the_sky_that_was_simulated(kind):
