@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import closing
@@ -28,18 +27,15 @@ from lnocl.runs.preparation import Prepared, prepare
 from lnocl.runs.progress import Progress
 from lnocl.scene.arrays import Array, together, whole
 from lnocl.scene.counts import mean_exposure, means
-from lnocl.scene.geometry import Box
-from lnocl.scene.grid import length_for, psf_shape
+from lnocl.scene.grid import psf_shape
 from lnocl.scene.observation import Observation
 from lnocl.scene.padding import recommend_pad
 from lnocl.scene.scaled_penalty import EDGE
 from lnocl.scene.scene import Scene
-from lnocl.scene.transforms import part as part_of
+from lnocl.tiling import Span, Tile, cut, lay
 
-# The side of a tile in those of the PSFs, where these vary: docs/validation/tiles.md.
-SIDES = 5
-# Where they do not.
-LARGE_TILE = 2048
+# Of those of `lnocl.deconvolve`, beside parameters.
+OPTIONS = {"solver", "precision", "engine", "device", "pad", "refine_positions", "refine_psfs"}
 # The tiles with the brightest extended source, of whose choices that in the middle is taken.
 N_CHOOSING = 3
 # Warnings of tiles that are given in full.
@@ -87,92 +83,6 @@ class TiledResult(Result):
     """
 
     tiles: NDArray[np.void]
-
-
-class _Span(NamedTuple):
-    """A tile along one axis, in pixels of an image without offset.
-
-    Attributes
-    ----------
-    core : range
-        What it stands for.
-    window : range
-        What it sees: the core and its margins.
-    sky : range
-        What all tiles stand for.
-    margin : int
-        Pixels round the core that are seen, at least.
-    """
-
-    core: range
-    window: range
-    sky: range
-    margin: int
-
-    def holds(self, places: Array) -> NDArray[np.bool_]:
-        """Return which places lie in the core, or beyond the sky next to it."""
-        nearest = np.clip(np.floor(places + 0.5), self.sky.start, self.sky.stop - 1)
-        return np.asarray((nearest >= self.core.start) & (nearest < self.core.stop))
-
-    def own(self, n: int, oversample: int) -> slice:
-        """Return where in the window the core lies, of a frame of n pixels, each `oversample`."""
-        ends = (min(max(end, 0), n) for end in (self.core.start, self.core.stop))
-        first, last = (oversample * (end - self.window.start) for end in ends)
-        return slice(first, last)
-
-    def weights(self, oversample: int) -> Array:
-        """Return the weights of the window's pixels, which fall across half of each margin.
-
-        Those of neighbours sum to 1.
-        """
-        at = (np.arange(oversample * len(self.window)) + 0.5) / oversample + self.window.start
-        weights = np.ones_like(at)
-        if self.core.start > self.sky.start:
-            weights *= np.clip(0.5 + (at - self.core.start) / self.margin, 0.0, 1.0)
-        if self.core.stop < self.sky.stop:
-            weights *= np.clip(0.5 + (self.core.stop - at) / self.margin, 0.0, 1.0)
-        return weights
-
-
-class _Tile(NamedTuple):
-    """What a tile sees, and which stars are its own.
-
-    Attributes
-    ----------
-    spans : tuple of _Span
-        Along y and x.
-    boxes : list of tuple of range
-        Rows and columns of each image that are seen.
-    observation : Observation
-        What is in its window.
-    stars : ndarray of float64, shape (k, 2)
-        Positions in the window.
-    own, numbers : ndarray of int
-        Which of them lie in its core, and which those are of all stars.
-    core : tuple of slice
-        The pixels in the window of the extended source that it stands for.
-    near_stars : ndarray of float64 or None
-        As of `lnocl.scene.penalty.Penalty`, in its window.
-    """
-
-    spans: tuple[_Span, _Span]
-    boxes: list[Box]
-    observation: Observation
-    stars: Array
-    own: NDArray[np.intp]
-    numbers: NDArray[np.intp]
-    core: tuple[slice, slice]
-    near_stars: Array | None
-
-    def without_unseen_neighbours(self) -> _Tile:
-        """Return it without stars of its neighbours that it does not observe."""
-        if not self.observation.mask.any() or len(self.own) == len(self.stars):
-            return self
-        with ignored_warnings():
-            is_kept = Scene(self.observation).observes(self.stars)
-        is_kept[self.own] = True
-        own = np.cumsum(is_kept)[self.own] - 1
-        return self._replace(stars=self.stars[is_kept], own=own)
 
 
 class _Found(NamedTuple):
@@ -315,20 +225,27 @@ def deconvolve_tiles(
     check_observation(observation)
     if reason := for_the_whole(observation):
         raise InputError(reason)
-    _check_options(options)
+    if unknown := sorted(options.keys() - OPTIONS):
+        raise InputError(
+            f"{unknown[0]} is no option of tiles; leave it out, or take deconvolve for the whole"
+        )
     pad = options.pop("pad", "auto")
     given = {"mu": mu, "smoothing": smoothing, "n_iter": n_iter, "stop": stop, **options}
     plan = make_plan(observation, stars, **given)
     positions = plan.setup.stars
-    is_auto = isinstance(pad, str) and pad == "auto"
-    tile_pad = recommend_pad(observation) if is_auto else whole("pad", pad, 0, ", or auto")
-    tiles = _lay(plan.setup.observation, tile, tile_pad)
+    tile_pad = (
+        whole("pad", pad, 0, ", or auto") if str(pad) != "auto" else recommend_pad(observation)
+    )
+    tiles = lay(plan.setup.observation, tile, tile_pad)
     plan = replace(plan, setup=replace(plan.setup, pad=pad), in_tiles=True)
     prepared = prepare(plan, progress)
     observation, near_stars = prepared.setup.observation, prepared.penalties[0].near_stars
-    cut = (_cut(observation, positions, near_stars, spans) for spans in tiles)
-    observed = [*filter(None, cut)]
-    _refuse_unowned(positions, observed)
+    observed = [*filter(None, (cut(observation, positions, near_stars, at) for at in tiles))]
+    for x, y in np.delete(positions, np.concatenate([each.numbers for each in observed]), axis=0):
+        raise InputError(
+            f"the star at ({x:g}, {y:g}) lies in a tile that all images mask; leave it out or mend "
+            "the mask"
+        )
     if len(tiles) > 1:
         common = {"exposure": mean_exposure(observation)}
         if near_stars is not None or any(each.smoothing for each in prepared.penalties):
@@ -365,16 +282,6 @@ def _ending(prepared: Prepared, choice: Result) -> Prepared:
     return replace(prepared, stop=None)
 
 
-ALLOWED = {"solver", "precision", "engine", "device", "pad", "refine_positions", "refine_psfs"}
-
-
-def _check_options(options: dict[str, Any]) -> None:
-    if unknown := sorted(set(options) - ALLOWED):
-        raise InputError(
-            f"{unknown[0]} is no option of tiles; leave it out, or take deconvolve for the whole"
-        )
-
-
 def for_the_whole(observation: Observation) -> str | None:
     """Return why an observation is not for tiles, and what to do; None where it is."""
     if len(observation.halos):
@@ -385,88 +292,7 @@ def for_the_whole(observation: Observation) -> str | None:
     return None
 
 
-def _lay(observation: Observation, tile: int | None, pad: int) -> list[tuple[_Span, _Span]]:
-    """Return the tiles of all that the images show along y and x, row by row."""
-    # Of square PSFs that are turned the corners reach farther.
-    turns = abs(observation.turns) * observation.scales[:, None, None]
-    sides = np.ceil((turns @ psf_shape(observation)[::-1]).max(axis=0) / observation.oversample)
-    margins = [max(int(k) // 2, 1) for k in sides[::-1]]
-    if tile is None:
-        tile = length_for(SIDES * int(max(sides))) if observation.psf_fields else LARGE_TILE
-    least = 2 * (max(margins) + pad) + 16
-    tile = whole(
-        "tile",
-        tile,
-        least,
-        f", for margins of half a PSF, {max(margins)} pixels, and a pad of {pad} on each side",
-    )
-    geometry, window = observation.geometry, tile - 2 * pad
-    sky = geometry.covered([observation.good_box(j) for j in range(observation.n_images)])
-    if all(len(at) <= window for at in sky):  # the images as they are
-        windows = map(range, geometry.frame)
-        y, x = (_Span(at, seen, at, n) for at, seen, n in zip(sky, windows, margins, strict=True))
-        return [(y, x)]
-    rows, columns = (_divide(at, window, n) for at, n in zip(sky, margins, strict=True))
-    return list(itertools.product(rows, columns))
-
-
-def _divide(sky: range, window: int, margin: int) -> list[_Span]:
-    """Return tiles along an axis; their windows are of one size, so that programs serve all."""
-    n = 1 if len(sky) <= window else math.ceil(len(sky) / (window - 2 * margin))
-    window = min(window, len(sky))
-    edges = np.round(np.linspace(sky.start, sky.stop, n + 1)).astype(int).tolist()
-    first = [
-        min(max((a + b - window) // 2, sky.start), sky.stop - window)
-        for a, b in itertools.pairwise(edges)
-    ]
-    return [
-        _Span(range(a, b), range(at, at + window), sky, margin)
-        for (a, b), at in zip(itertools.pairwise(edges), first, strict=True)
-    ]
-
-
-def _cut(
-    observation: Observation,
-    positions: Array,
-    near_stars: Array | None,
-    spans: tuple[_Span, _Span],
-) -> _Tile | None:
-    """Return a tile, or None where nothing was observed."""
-    q, (rows, columns) = observation.oversample, (span.window for span in spans)
-    if all(span.core == span.sky for span in spans):  # one tile has the images as they are
-        ny, nx = observation.shape
-        part, boxes = observation, [(range(ny), range(nx))] * observation.n_images
-    else:
-        boxes = observation.geometry.windows(rows, columns)
-        y, x = ((each.core.start + each.core.stop - 1) / 2.0 - each.window.start for each in spans)
-        try:
-            part = observation.window(rows, columns, (x, y), boxes)
-        except InputError:  # no image has a good pixel there, or the sky is behind 0
-            return None
-    moved = positions - (columns.start, rows.start)
-    is_seen = part.shows(moved)
-    in_spans = [each.holds(at) for each, at in zip(spans, positions.T[::-1], strict=True)]
-    is_own = np.all([is_seen, *in_spans], axis=0)
-    own = np.flatnonzero(is_own[is_seen])
-    ny, nx = observation.geometry.frame
-    core = spans[0].own(ny, q), spans[1].own(nx, q)
-    if near_stars is not None:
-        down, along = (range(q * at.start, q * at.stop) for at in (rows, columns))
-        near_stars = part_of(near_stars, down, along).copy()
-    return _Tile(spans, boxes, part, moved[is_seen], own, np.flatnonzero(is_own), core, near_stars)
-
-
-def _refuse_unowned(positions: Array, tiles: Sequence[_Tile]) -> None:
-    """Refuse a star in a tile that no image has observed."""
-    numbers = np.concatenate([each.numbers for each in tiles])
-    for x, y in np.delete(positions, numbers, axis=0):
-        raise InputError(
-            f"the star at ({x:g}, {y:g}) lies in a tile that all images mask; leave it out or mend "
-            "the mask"
-        )
-
-
-def _choose(tiles: Sequence[_Tile], parallel: Parallel, prepared: Prepared) -> Result:
+def _choose(tiles: Sequence[Tile], parallel: Parallel, prepared: Prepared) -> Result:
     """Return the result in the middle of those of the tiles with the brightest extended source.
 
     One tile alone may be misled: of 1024 x 1024 fields, single tiles chose 5 to 136 iterations
@@ -478,7 +304,7 @@ def _choose(tiles: Sequence[_Tile], parallel: Parallel, prepared: Prepared) -> R
     return choices[len(choices) // 2]
 
 
-def _choice(prepared: Prepared, tile: _Tile) -> Result:
+def _choice(prepared: Prepared, tile: Tile) -> Result:
     with ignored_warnings(LnoclWarning):  # the tile is done again
         outcome = _outcome(prepared, tile.without_unseen_neighbours())
         return _alone(make_result(outcome), extended=np.zeros(0))
@@ -489,7 +315,7 @@ def _alone(result: Result, **changes: Any) -> Result:
     return replace(result, _findings=cast(Any, None), **changes)
 
 
-def _outcome(prepared: Prepared, tile: _Tile) -> Outcome:
+def _outcome(prepared: Prepared, tile: Tile) -> Outcome:
     prepared = prepared.of(tile.observation, tile.stars).penalised(near_stars=tile.near_stars)
     outcome = reconstruct(prepared)
     if prepared.fits and len(tile.stars):
@@ -497,7 +323,7 @@ def _outcome(prepared: Prepared, tile: _Tile) -> Outcome:
     return replace(outcome, psf_refinement=prepared.refinement)
 
 
-def _solve(prepared: Prepared, tile: _Tile) -> _Found:
+def _solve(prepared: Prepared, tile: Tile) -> _Found:
     from lnocl.solvers.light import Light  # which loads scipy
 
     tile = tile.without_unseen_neighbours()
@@ -531,7 +357,7 @@ def _solve(prepared: Prepared, tile: _Tile) -> _Found:
     )
 
 
-def _light(tile: _Tile) -> float:
+def _light(tile: Tile) -> float:
     """Return the counts above the background but for those within half a PSF of a star.
 
     Bright stars mislead the choice, most of all where PSFs are not quite right: both halves of the
@@ -561,7 +387,7 @@ class _Mosaic:
     may_free_pixels = False
 
     def __init__(
-        self, observation: Observation, positions: Array, plan: Plan, spans: tuple[_Span, _Span]
+        self, observation: Observation, positions: Array, plan: Plan, spans: tuple[Span, Span]
     ) -> None:
         self.plan, n_epochs = tuple(str(plan).splitlines()), observation.n_epochs
         self.observation = observation
@@ -573,7 +399,7 @@ class _Mosaic:
         self._stars = np.zeros((len(self.given_positions), 6))
         self.found: list[_Found] = []
 
-    def add(self, tile: _Tile, found: _Found) -> None:
+    def add(self, tile: Tile, found: _Found) -> None:
         """Add what a tile has found."""
         (y, x), q, sky = tile.spans, self.observation.oversample, found.result.extended
         weights = np.multiply.outer(y.weights(q), x.weights(q))
@@ -586,7 +412,7 @@ class _Mosaic:
         result = replace(found.result, extended=nothing)
         self.found.append(found._replace(result=result, models=nothing))
 
-    def add_models(self, tile: _Tile, models: Array) -> None:
+    def add_models(self, tile: Tile, models: Array) -> None:
         """Take the pixels of images that show the core of a tile from the models of its window."""
         y, x = tile.spans
         for j, (box, model) in enumerate(zip(tile.boxes, models, strict=True)):

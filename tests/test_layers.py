@@ -17,7 +17,7 @@ FLOORS = [
     {"simulation", "plotting"},
     {"engines"},
     {"runs"},
-    {"significance", "checkpoint"},
+    {"significance", "checkpoint", "tiling"},
     {"result"},
     {"reconstruction"},
     {"deconvolution"},

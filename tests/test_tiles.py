@@ -13,7 +13,7 @@ from scipy.interpolate import RegularGridInterpolator
 from scipy.signal import fftconvolve
 
 import lnocl
-from lnocl import PsfField, tiles
+from lnocl import PsfField, tiles, tiling
 from lnocl.commands import cli
 from lnocl.commands.deconvolve import in_tiles
 from lnocl.errors import InputError
@@ -216,7 +216,7 @@ def test_fields_are_part_of_what_a_checkpoint_is_of(tmp_path):
 @given(st.integers(20, 400), st.integers(24, 120), st.integers(1, 12), st.sampled_from([1, 2, 4]))
 def test_tiles_cover_an_axis_and_their_weights_sum_to_one(size, window, margin, oversample):
     window = max(window, 2 * margin + 8)
-    spans = tiles._divide(range(size), window, margin)
+    spans = tiling.divide(range(size), window, margin)
     assert [n for span in spans for n in span.core] == list(range(size))
     total = np.zeros(oversample * size)
     for span in spans:
@@ -392,11 +392,11 @@ def test_tiles_come_near_a_psf_for_each_pixel():
     observation = lnocl.Observation(exact, field)
     inner, peak = np.s_[HALF:-HALF, HALF:-HALF], exact.max()
     one = fftconvolve(sky, vary(63.5, 63.5), "same")
-    spans = tiles._divide(range(N), 62, 10)
+    spans = tiling.divide(range(N), 62, 10)
     seen = np.zeros_like(sky)
     for y in spans:
         for x in spans:
-            tile = tiles._cut(observation, np.zeros((0, 2)), None, (y, x))
+            tile = tiling.cut(observation, np.zeros((0, 2)), None, (y, x))
             image = fftconvolve(sky, tile.observation.psfs[0], "same")
             rows, columns = y.core, x.core
             core = np.s_[rows.start : rows.stop, columns.start : columns.stop]
@@ -421,9 +421,9 @@ def test_light_of_stars_makes_no_tile_bright():
     images = observation.images.copy()
     images[0, 20, 20] += 1e7
     starry = lnocl.Observation(images, observation.psfs, background=5.0)
-    spans = tiles._divide(range(N), 64, 10)[0]
-    empty = tiles._cut(observation, np.zeros((0, 2)), None, (spans, spans))
-    tile = tiles._cut(starry, np.array([[20.0, 20.0]]), None, (spans, spans))
+    spans = tiling.divide(range(N), 64, 10)[0]
+    empty = tiling.cut(observation, np.zeros((0, 2)), None, (spans, spans))
+    tile = tiling.cut(starry, np.array([[20.0, 20.0]]), None, (spans, spans))
     assert tiles._light(tile) < tiles._light(empty)
     assert tiles._light(tile._replace(stars=np.zeros((0, 2)))) > 9e6
 
@@ -471,7 +471,7 @@ def test_images_that_are_shifted_are_seen_whole_by_tiles():
     )  # fmt: skip
     run = {"n_iter": 300, "smoothing": 0.02, **RUN}
     whole = lnocl.deconvolve(observation, pad=30, **run)
-    result = lnocl.deconvolve_tiles(observation, tile=160, **run)
+    result = lnocl.deconvolve_tiles(observation, tile=96, **run)
     assert len(result.tiles) > 4
     inner = np.s_[16:-16, far + 16 : -16]
     difference = abs(result.extended - whole.extended)[inner] / whole.extended[inner].max()

@@ -9,7 +9,7 @@ import pytest
 from turned_scenes import COVARIANCES, gaussian, psf
 
 import lnocl
-from lnocl import tiles
+from lnocl import tiles, tiling
 from lnocl.scene.estimate import Estimate
 from lnocl.scene.scene import Scene
 
@@ -112,10 +112,10 @@ def test_cores_of_tiles_are_the_images_that_were_simulated(kind):
     """
     observation, means, fluxes = observe(kind, side=19)
     upright = observation.upright()
-    laid = tiles._lay(upright, 80 if kind == "scaled" else 56, 5)
+    laid = tiling.lay(upright, 80 if kind == "scaled" else 56, 5)
     mosaic = tiles._Mosaic(upright, STARS, "", laid[0])
     assert len(laid) > 1
-    for tile in filter(None, (tiles._cut(upright, STARS, None, spans) for spans in laid)):
+    for tile in filter(None, (tiling.cut(upright, STARS, None, spans) for spans in laid)):
         scene = Scene(tile.observation, tile.stars, pad=5)
         rows, columns = (span.window for span in tile.spans)
         sky = np.zeros(scene.grid)
@@ -147,6 +147,19 @@ def test_stars_of_tiles_have_a_flux_in_each_epoch():
     early, late = found.star_fluxes.reshape(-1, 2).T
     np.testing.assert_allclose(late / early, RISES[::-1], rtol=0.02)
     assert len(found.star_residuals()) == 6
+
+
+@pytest.mark.filterwarnings("error:invalid value")
+def test_an_image_that_a_tile_does_not_see_tells_nothing_of_its_light():
+    counts = np.random.default_rng(0).poisson(20.0, (2, 12, 14))
+    psf_of_all = np.ones((2, 3, 2))
+    bad = np.zeros(counts.shape, bool)
+    bad[1] = True
+    both = lnocl.Observation(counts, psf_of_all, mask=bad)
+    one = lnocl.Observation(counts[:1], psf_of_all[:1])
+    run = RUN | {"n_iter": 3}
+    fluxes = [lnocl.deconvolve(each, **run).extended_flux for each in (both, one)]
+    np.testing.assert_allclose(fluxes[0], fluxes[1], rtol=1e-6)
 
 
 @pytest.mark.exhaustive

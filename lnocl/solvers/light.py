@@ -143,6 +143,6 @@ def _over(image: Array, ones: Array | float) -> Array:
 
 def _quotient(factor: Array, weights: Array) -> Array:
     """Return a factor over weights, 0 where these are."""
-    if is_flat(weights):
+    if is_flat(weights) and weights[0, 0] > 0:
         return factor / weights[0, 0] if weights[0, 0] != 1.0 else factor
     return np.divide(factor, weights, out=np.zeros(factor.shape), where=weights > 0)
