@@ -13,7 +13,7 @@ import pytest
 from test_layers import MODULES, PACKAGE, imports
 
 # Lines of code of the package and of its core, rounded up to tens; less code lowers them.
-BUDGET = {"package": 23_390, "core": 11_090}
+BUDGET = {"package": 23_390, "core": 11_100}
 CORE = "scene", "engines", "opencl", "reference", "solvers", "runs"
 # What the core is not to know, nor the rooms round it.
 OUTSIDE = "astropy.io", "matplotlib", "dask", "distributed"

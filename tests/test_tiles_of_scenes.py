@@ -34,6 +34,7 @@ BEHIND = {"transmission": True}
 TURNED = {"transforms": lnocl.rotations([0.0, 17.0, -75.0], (27.0, 20.0))}
 SCALED = {"transforms": TURNED["transforms"].copy()}
 SCALED["transforms"][2] = [[0.6, 0.1, -2.2], [-0.1, 0.6, 5.1]]
+FINER = {"oversample": 2, "effective_psfs": True}
 KINDS = {
     "epochs": EPOCHS,
     "transmission": BEHIND,
@@ -42,6 +43,8 @@ KINDS = {
     "turned": TURNED,
     "scaled": SCALED,
     "turned, epochs, transmission": TURNED | EPOCHS | BEHIND,
+    "finer": FINER,
+    "turned, finer": TURNED | FINER,
 }
 
 
@@ -97,7 +100,8 @@ def observe(kind, seed=0, side=13):
     counts = [rng.poisson(mean) for mean in means]
     if has_mask:
         given["transmission"] = shares(*np.indices(SHAPE)[::-1])
-    y, x = np.indices((side, side)) - side // 2
+    q = given.get("oversample", 1)
+    y, x = (np.indices((q * side + 1 - q % 2,) * 2) - q * side // 2) / q
     psfs = [psf(x, y, each) for each in PSF_COVARIANCES]
     observation = lnocl.Observation(counts, psfs, background=5.0, exposure=EXPOSURE, **given)
     return observation, means, np.transpose(of_images[: 1 + has_epochs]).ravel()
@@ -118,8 +122,10 @@ def test_cores_of_tiles_are_the_images_that_were_simulated(kind):
     for tile in filter(None, (tiling.cut(upright, STARS, None, spans) for spans in laid)):
         scene = Scene(tile.observation, tile.stars, pad=5)
         rows, columns = (span.window for span in tile.spans)
-        sky = np.zeros(scene.grid)
-        sky[: len(rows), : len(columns)] = make_sky(*np.ix_(rows, columns))
+        sky, q = np.zeros(scene.grid), scene.oversample
+        fine = (np.arange(q * at.start, q * at.stop) - (q - 1) / 2 for at in (rows, columns))
+        y, x = np.ix_(*(each / q for each in fine))
+        sky[: y.size, : x.size] = make_sky(y, x) / q**2
         seen = abs(tile.stars[:, None] + (columns[0], rows[0]) - STARS).sum(axis=2).argmin(axis=1)
         estimate = Estimate(scene, sky, fluxes.reshape(3, -1)[seen].ravel())
         models = [scene.in_electrons(each, j) for j, each in enumerate(estimate.models())]
@@ -175,8 +181,11 @@ def test_tiles_are_the_whole_and_the_sky_that_was_simulated(kind):
     assert difference.max() < 4e-3 * whole.extended.max()
     np.testing.assert_allclose(found.star_fluxes, whole.star_fluxes, rtol=2e-4)
     np.testing.assert_allclose(found.star_flux_errors, whole.star_flux_errors, rtol=0.02)
-    sky = make_sky(*np.indices(SHAPE))
-    errors = [np.linalg.norm(each.extended - sky) for each in (whole, found)]
+    sky, q = make_sky(*np.indices(SHAPE)), observation.oversample
+    (ny, nx), errors = SHAPE, []
+    for each in (whole, found):
+        pixels = each.extended.reshape(ny, q, nx, q).sum(axis=(1, 3))
+        errors.append(np.linalg.norm(pixels - sky))
     assert errors[1] == pytest.approx(errors[0], rel=0.01)
     for each in (whole, found):
         assert (abs(each.star_fluxes - fluxes) < 3 * each.star_flux_errors).all()

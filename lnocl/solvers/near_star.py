@@ -21,6 +21,7 @@ from lnocl.scene.camera import Camera, adjoint_of, seen_by
 from lnocl.scene.estimate import Estimate
 from lnocl.scene.scene import Scene
 from lnocl.scene.texture import Texture, hidden_radii, hidden_radius, resolution
+from lnocl.scene.transforms import enlarged
 from lnocl.scene.view import Places, View, Window
 from lnocl.solvers.fluxes import precision
 from lnocl.solvers.least_squares import Field, LeastSquares, LevelError, LinearImage, SourceError
@@ -149,7 +150,7 @@ class NearStar:
             return (scene.gains * scene.areas)[:, None, None]
         ones = np.broadcast_to(1.0, scene.grid)
         pairs = zip(around.cameras, self._views, strict=True)
-        return np.array([_padded(a.part(ones, v.window.ranges), shape) for a, v in pairs])
+        return np.array([enlarged(a.part(ones, v.window.ranges), shape) for a, v in pairs])
 
     def places(self, scene: Scene) -> Places:
         """Return the rows and columns of the window in the sky, on the grid."""
@@ -162,7 +163,10 @@ class NearStar:
         """
         pairs = zip(change, self._views, strict=True)
         return np.array(
-            [[np.vdot(each, _padded(level, each.shape)) for level in v.levels] for each, v in pairs]
+            [
+                [np.vdot(each, enlarged(level, each.shape)) for level in v.levels]
+                for each, v in pairs
+            ]
         )
 
     @cached_property
@@ -187,7 +191,7 @@ class NearStar:
         ]
 
         def forward(sky: Array) -> Array:
-            return np.array([_padded(each, shape) for each in seen_by(windows, sky)])
+            return np.array([enlarged(each, shape) for each in seen_by(windows, sky)])
 
         def adjoint(images: Iterable[Array]) -> Array:
             pairs = zip(windows, images, strict=True)
@@ -205,12 +209,12 @@ class NearStar:
         """
         image = sources.linear(view, view.model(around.estimate, camera))
         n, shape = len(image.unknowns), self.window.shape
-        slopes = _padded(image.slopes.reshape(n, *view.window.shape), shape)
+        slopes = enlarged(image.slopes.reshape(n, *view.window.shape), shape)
         return LinearImage(
             slopes.reshape(n, math.prod(shape)),
             image.unknowns,
-            _padded(image.left, shape) - beyond,
-            _padded(image.precision, shape),
+            enlarged(image.left, shape) - beyond,
+            enlarged(image.precision, shape),
         )
 
 
@@ -232,12 +236,6 @@ def _texture_in(window: Window, around: Surroundings) -> tuple[tuple[slice, slic
     )
     extended = around.estimate.part(whole.of(scene.grid))
     return (there[0], there[1]), Texture(extended, stars[inside], width, around.hidden[inside])
-
-
-def _padded(image: Array, shape: tuple[int, int]) -> Array:
-    """Return the pixels of a window of an image in an array of the shape of the largest."""
-    beyond = [(0, n - k) for n, k in zip(shape, image.shape[-2:], strict=True)]
-    return np.pad(image, [(0, 0)] * (image.ndim - 2) + beyond) if any(map(any, beyond)) else image
 
 
 def _window_round(scene: Scene, star: Array, side: float) -> Window:
