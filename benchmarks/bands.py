@@ -15,10 +15,10 @@ from experiment import NEAR_STAR, width_profile, width_threshold
 
 import lnocl
 from lnocl import metrics
+from lnocl.core.runs.bootstrap import Bootstrap, Quantity
+from lnocl.core.runs.replicas import Replicas
 from lnocl.plotting.figure import save_figure
 from lnocl.plotting.profiles import draw_bands
-from lnocl.runs.bootstrap import Bootstrap, Quantity
-from lnocl.runs.replicas import Replicas
 from lnocl.simulation import Experiment, hh34, simulate
 
 # Rows of less light than this share of the brightest are not the jet's.

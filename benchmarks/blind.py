@@ -28,9 +28,9 @@ from psfs import ERRORS, EXPERIMENT, FAMILIES, make_scene
 from scipy.optimize import brentq
 
 import lnocl
+from lnocl.core.scene.forward_model import Model
+from lnocl.core.scene.scene import Scene
 from lnocl.metrics import restoration_error, star_rows
-from lnocl.scene.forward_model import Model
-from lnocl.scene.scene import Scene
 
 ROUNDS, OF_SKY, OF_PSFS = 20, 15, 10
 LEVEL, NOISE = EXPERIMENT.sky_electrons, EXPERIMENT.read_noise.value

@@ -23,10 +23,10 @@ from regions import CirclePixelRegion, PixCoord, RectanglePixelRegion
 from scipy.special import expit
 
 import lnocl
+from lnocl.core.runs.bootstrap import Bootstrap, Quantity
+from lnocl.core.scene.shifting import place
 from lnocl.io.regions import read_apertures
 from lnocl.plotting.figure import new_figure, save_figure
-from lnocl.runs.bootstrap import Bootstrap, Quantity
-from lnocl.scene.shifting import place
 from lnocl.simulation.fizeau import fizeau_psf
 
 N = 64

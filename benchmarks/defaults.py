@@ -46,7 +46,7 @@ import numpy as np
 from astropy.table import Table
 
 import lnocl
-from lnocl.scene.penalty import recommend_smoothing
+from lnocl.core.scene.penalty import recommend_smoothing
 
 N = 96
 KINDS = ("jet", "host", "ring", "disc", "alone")

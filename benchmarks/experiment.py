@@ -10,8 +10,8 @@ import numpy as np
 
 import lnocl
 from lnocl import metrics
+from lnocl.core.runs.options import PAPER
 from lnocl.errors import InputError
-from lnocl.runs.options import PAPER
 
 CURVE_DTYPE = np.dtype(
     [("iteration", int), ("rho", float), ("rho_star", float), ("magnitude", float)]

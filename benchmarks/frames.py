@@ -33,9 +33,9 @@ from parts import paper
 from scipy.ndimage import gaussian_filter
 
 import lnocl
-import lnocl.scene.grid
+import lnocl.core.scene.grid
+from lnocl.core.scene.padding import recommend_pad
 from lnocl.metrics import restoration_error
-from lnocl.scene.padding import recommend_pad
 from lnocl.simulation import Experiment, fizeau_psf, hh34, simulate
 
 SKY = 768
@@ -164,7 +164,7 @@ class Sky:
 
 def grid_of(kind, shape, pad):
     """Return the grid that lnocl takes."""
-    return lnocl.scene.grid.grid_of(sky(kind, shape, False, 0).observation(), pad)
+    return lnocl.core.scene.grid.grid_of(sky(kind, shape, False, 0).observation(), pad)
 
 
 def measure(kind, shape, has_star, pad, solver, device):

@@ -17,7 +17,7 @@ from types import SimpleNamespace
 
 import numpy as np
 
-from lnocl.opencl.tuning import Tuning
+from lnocl.core.opencl.tuning import Tuning
 
 LENGTHS = [64 * 2**k for k in range(8)]
 LOCAL_KIB = 32, 48, 64, 96, 128

@@ -17,9 +17,9 @@ import sides
 from astropy.table import Table
 from iteration import facts, take_turns
 
-from lnocl.opencl.device import choose
-from lnocl.scene.grid import LENGTHS, length_for
-from lnocl.scene.scene import Scene
+from lnocl.core.opencl.device import choose
+from lnocl.core.scene.grid import LENGTHS, length_for
+from lnocl.core.scene.scene import Scene
 
 LEAST = 200
 PAD = 0.1

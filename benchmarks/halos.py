@@ -40,7 +40,7 @@ import numpy as np
 from astropy.table import Table
 
 import lnocl
-from lnocl.scene.penalty import recommend_smoothing
+from lnocl.core.scene.penalty import recommend_smoothing
 
 N, CENTRE, RESOLUTION = 128, 64, 3.5
 AMOUNT = 4e6 * np.array([0.8, 0.9, 1.1, 1.2])

@@ -19,8 +19,8 @@ from regions import CirclePixelRegion, PixCoord
 from scipy.ndimage import uniform_filter
 
 import lnocl
-from lnocl.runs import replicas
-from lnocl.scene.texture import Texture
+from lnocl.core.runs import replicas
+from lnocl.core.scene.texture import Texture
 
 
 class Smooth(Texture):

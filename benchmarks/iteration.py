@@ -30,10 +30,10 @@ from astropy.table import Table, vstack
 from experiment import observe
 from machine import bytes_moved, measure, operations
 
-from lnocl.opencl import program
-from lnocl.opencl.device import choose, describe
-from lnocl.scene.penalty import Penalty
-from lnocl.scene.scene import Scene
+from lnocl.core.opencl import program
+from lnocl.core.opencl.device import choose, describe
+from lnocl.core.scene.penalty import Penalty
+from lnocl.core.scene.scene import Scene
 from lnocl.simulation import Experiment, hh34, simulate
 
 SIZES = (64, 128, 256, 512, 1024, 2048, 4096)

@@ -17,10 +17,10 @@ import sides
 from astropy.table import Table
 from machine import bytes_moved
 
-from lnocl.opencl.device import choose, describe
-from lnocl.opencl.launch import Launch
-from lnocl.opencl.tuning import Tuning, chosen
-from lnocl.scene.scene import Scene
+from lnocl.core.opencl.device import choose, describe
+from lnocl.core.opencl.launch import Launch
+from lnocl.core.opencl.tuning import Tuning, chosen
+from lnocl.core.scene.scene import Scene
 
 SECONDS = 0.1
 

@@ -27,11 +27,11 @@ from iteration import facts, rows, take_turns
 from parts import paper
 from precision import scene
 
+from lnocl.core.opencl import program
+from lnocl.core.opencl.device import choose, describe
+from lnocl.core.scene.scene import MIN_MODEL, Scene
 from lnocl.errors import DeviceError
 from lnocl.metrics import star_rows
-from lnocl.opencl import program
-from lnocl.opencl.device import choose, describe
-from lnocl.scene.scene import MIN_MODEL, Scene
 
 TIMED_SIZE, N_IMAGES = 1024, 4
 ITERATIONS, STAR_ITERATIONS = 1000, 600
@@ -141,7 +141,7 @@ class Knob:
         return patch.multiple(program, **changes)
 
     def radices(self, n):
-        """Return odd factor and radices, as lnocl.opencl.program.radices does; n a power of two."""
+        """Return odd factor and radices, as lnocl.core.opencl.program does; n is a power of two."""
         outer = n // self.last
         while outer > 8:
             outer //= 8

@@ -22,8 +22,8 @@ import pyopencl as cl
 from parts import paper
 
 import lnocl
-from lnocl.opencl.device import choose
-from lnocl.opencl.program import Program, forget_programs
+from lnocl.core.opencl.device import choose
+from lnocl.core.opencl.program import Program, forget_programs
 
 SOLVERS = ("sgm", "sgp")
 SHORT = 10

@@ -7,7 +7,8 @@ centre   of a star in noise of 1/100 of its peak, pixels rms in a coordinate: th
          wide, one 1.5 wide, a Fizeau PSF, and the first with a neighbour a fifth as bright, 8 off
 repair   of a block of bad pixels in the core, share of the peak, rms: `lnocl.psf.repair`, and
          astropy.convolution.interpolate_replace_nans with Gaussian kernels of sigma 1 and 2
-shift    by random parts of a pixel, share of the peak, the largest: `lnocl.scene.shifting`, and
+shift    by random parts of a pixel, share of the peak, the largest: `lnocl.core.scene.shifting`,
+and
          scipy.ndimage.shift by splines and fourier_shift
 rotation by random angles, the same: `lnocl.psf.resampling`, and scipy.ndimage.rotate by splines
 sky      level under a jet and stars, in its standard errors: `lnocl.io.levels`, the sigma-clipped

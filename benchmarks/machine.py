@@ -11,7 +11,7 @@ import time
 import numpy as np
 import pyopencl as cl
 
-from lnocl.opencl.device import choose, describe
+from lnocl.core.opencl.device import choose, describe
 
 COPY_BYTES = 2**28
 ROUNDS = 100_000

@@ -15,7 +15,7 @@ import time
 import numpy as np
 
 import lnocl
-from lnocl.scene.shifting import MovablePsf
+from lnocl.core.scene.shifting import MovablePsf
 
 N = 512
 

@@ -36,9 +36,9 @@ from scipy.optimize import least_squares
 from scipy.special import j1
 
 import lnocl
-from lnocl.engines.opencl import OpenCLEngine
-from lnocl.scene.detector import movable_psfs
-from lnocl.scene.scene import Scene
+from lnocl.core.engines.opencl import OpenCLEngine
+from lnocl.core.scene.detector import movable_psfs
+from lnocl.core.scene.scene import Scene
 
 FINE = 16
 KINDS = ("gaussian", "moffat", "airy")

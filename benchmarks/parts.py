@@ -5,8 +5,8 @@ from functools import partial
 from astropy.table import Table
 
 import lnocl
-from lnocl.opencl.device import choose, describe
-from lnocl.runs.options import PAPER
+from lnocl.core.opencl.device import choose, describe
+from lnocl.core.runs.options import PAPER
 
 # The paper's iteration, but for what is given.
 paper = partial(lnocl.deconvolve, **PAPER)

@@ -33,13 +33,13 @@ from astropy.table import Table
 from parts import paper
 from sgp import make
 
+from lnocl.core.runs.run import Run
+from lnocl.core.scene.forward_model import Model
+from lnocl.core.scene.observation import Observation
+from lnocl.core.scene.penalty import recommend_smoothing
+from lnocl.core.scene.scene import Scene
+from lnocl.core.solvers.positions import StarFit, Stars
 from lnocl.metrics import restoration_error, star_rows
-from lnocl.runs.run import Run
-from lnocl.scene.forward_model import Model
-from lnocl.scene.observation import Observation
-from lnocl.scene.penalty import recommend_smoothing
-from lnocl.scene.scene import Scene
-from lnocl.solvers.positions import StarFit, Stars
 
 SIZE, FRAMES, STARS = 128, 8, 25
 FLUXES = (1e4, 3e4, 1e5, 3e5, 1e6)
@@ -254,8 +254,8 @@ def choices(device):
     """Yield rows of the part "choices"."""
     variants = {
         "lnocl": contextlib.nullcontext,
-        "first at 1": lambda: patch("lnocl.runs.run.FIRST_REFINED", 1),
-        "first at 12": lambda: patch("lnocl.runs.run.FIRST_REFINED", 12),
+        "first at 1": lambda: patch("lnocl.core.runs.run.FIRST_REFINED", 1),
+        "first at 12": lambda: patch("lnocl.core.runs.run.FIRST_REFINED", 12),
         "restarted at 3": lambda: restarted(3),
         "restarted at 3, 6": lambda: restarted(6),
         "mu 1e-4": contextlib.nullcontext,

@@ -17,8 +17,8 @@ from astropy.table import Table
 from parts import paper
 
 import lnocl
+from lnocl.core.opencl.device import choose, describe
 from lnocl.metrics import star_rows
-from lnocl.opencl.device import choose, describe
 from lnocl.simulation import Experiment, hh34, simulate
 
 SIZE, CONTRAST, ITERATIONS = 256, 1.0, 10_000

@@ -31,9 +31,9 @@ import numpy as np
 from astropy.table import Table
 
 import lnocl
+from lnocl.core.scene.psf_families import PsfFamilies, spectrum
+from lnocl.core.scene.pupils import Pupil
 from lnocl.metrics import restoration_error, star_rows
-from lnocl.scene.psf_families import PsfFamilies, spectrum
-from lnocl.scene.pupils import Pupil
 from lnocl.simulation import Experiment, fizeau_psf, fizeau_pupil, hh34
 
 ERRORS = ("none", "shift", "jitter", "strehl", "phase", "speckle", "all")

@@ -14,10 +14,10 @@ import time
 import numpy as np
 
 import lnocl
-from lnocl.runs.replicas import Replicas
-from lnocl.runs.run import Run
-from lnocl.runs.start import make_start
-from lnocl.scene.penalty import Penalty
+from lnocl.core.runs.replicas import Replicas
+from lnocl.core.runs.run import Run
+from lnocl.core.runs.start import make_start
+from lnocl.core.scene.penalty import Penalty
 
 
 def peak():

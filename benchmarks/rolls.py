@@ -36,7 +36,7 @@ from astropy.table import Table
 from scipy.ndimage import affine_transform
 
 import lnocl
-from lnocl.opencl.device import choose, describe
+from lnocl.core.opencl.device import choose, describe
 
 try:
     from vip_hci.psfsub import median_sub, pca

@@ -36,10 +36,10 @@ from scipy.ndimage import affine_transform, gaussian_filter
 from turned import SECONDS_A_TURN, iterate
 
 import lnocl
-from lnocl.engines.opencl import OpenCLEngine
-from lnocl.opencl.device import choose, describe
-from lnocl.runs.start import Setup, make_start
-from lnocl.scene.penalty import Penalty
+from lnocl.core.engines.opencl import OpenCLEngine
+from lnocl.core.opencl.device import choose, describe
+from lnocl.core.runs.start import Setup, make_start
+from lnocl.core.scene.penalty import Penalty
 
 N = 128
 MIDDLE = np.full(2, (N - 1) / 2.0)
@@ -175,7 +175,7 @@ def measure(kind, seed, width, options):
         n = 2 * round(0.5 * scale * len(deep_psf)) + 1
         to_psf = deep_map(scale, DEGREES, np.full(2, n // 2), len(deep_psf))
         fine_psf = resampled(deep_psf, to_psf, (n, n), 0.0)
-        stack = lnocl.scene.transforms.of_one_shape([psf, fine_psf], 0.0, about_centre=True)
+        stack = lnocl.core.scene.transforms.of_one_shape([psf, fine_psf], 0.0, about_centre=True)
         levels = {"background": [SKY, DEEPER * SKY], "exposure": [1.0, DEEPER]}
         both = np.stack([sharp, fine])
         yield row("resampled", scale, both, stack, **levels)

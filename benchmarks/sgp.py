@@ -39,10 +39,10 @@ from astropy.io import fits
 from parts import paper
 
 import lnocl
+from lnocl.core.runs.thinning import split_counts
+from lnocl.core.scene.forward_model import Model
+from lnocl.core.scene.scene import Scene
 from lnocl.metrics import restoration_error, star_rows
-from lnocl.runs.thinning import split_counts
-from lnocl.scene.forward_model import Model
-from lnocl.scene.scene import Scene
 from lnocl.simulation import Experiment, Star, Target, hh34, load_target, simulate
 from lnocl.studies.files import write_simulation
 
@@ -288,8 +288,8 @@ def choices(data, device):
         simulation = make(name, size, data, contrast)
         for shift, kept in settings:
             with (
-                patch("lnocl.solvers.scaling.SHIFT", shift),
-                patch("lnocl.solvers.sgp.N_LENGTHS", kept),
+                patch("lnocl.core.solvers.scaling.SHIFT", shift),
+                patch("lnocl.core.solvers.sgp.N_LENGTHS", kept),
             ):
                 curve = follow(simulation, "sgp", n_iter, device=device)
             best = curve[np.argmin(curve[:, 2])]

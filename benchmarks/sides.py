@@ -12,10 +12,10 @@ import numpy as np
 import scipy.fft
 
 import lnocl
-from lnocl.engines.opencl import OpenCLEngine
-from lnocl.scene.forward_model import Model
-from lnocl.solvers.scaling import prepare
-from lnocl.solvers.sgp import sgp
+from lnocl.core.engines.opencl import OpenCLEngine
+from lnocl.core.scene.forward_model import Model
+from lnocl.core.solvers.scaling import prepare
+from lnocl.core.solvers.sgp import sgp
 
 WORKERS = os.cpu_count()
 
@@ -254,7 +254,7 @@ class VkFFT:
         from pyopencl.elementwise import ElementwiseKernel
         from pyvkfft.opencl import VkFFTApp
 
-        from lnocl.opencl.device import choose
+        from lnocl.core.opencl.device import choose
 
         context = cl.Context([choose(device).device])
         self.queue = cl.CommandQueue(context)

@@ -18,7 +18,7 @@ import numpy as np
 from parts import paper
 from sides import Lnocl, observation
 
-from lnocl.scene.scene import Scene
+from lnocl.core.scene.scene import Scene
 
 ITERATIONS = 200
 

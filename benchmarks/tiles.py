@@ -24,8 +24,8 @@ import numpy as np
 from scipy.signal import fftconvolve
 
 import lnocl
+from lnocl.core.scene.shifting import MovablePsf
 from lnocl.metrics import restoration_error
-from lnocl.scene.shifting import MovablePsf
 
 warnings.simplefilter("ignore", lnocl.LnoclWarning)
 

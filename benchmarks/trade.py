@@ -9,7 +9,7 @@ import argparse
 import numpy as np
 from astropy.table import Table
 
-from lnocl.opencl.device import choose, describe
+from lnocl.core.opencl.device import choose, describe
 from lnocl.plotting.figure import line_style, new_figure, save_figure
 from lnocl.studies import bench
 

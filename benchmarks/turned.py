@@ -16,12 +16,12 @@ import numpy as np
 from astropy.table import Table
 
 import lnocl
-from lnocl.engines.opencl import OpenCLEngine
-from lnocl.opencl.device import choose, describe
-from lnocl.runs.start import Setup, make_start
-from lnocl.scene.penalty import Penalty
-from lnocl.scene.rotation import Rotation
-from lnocl.scene.transforms import rotation
+from lnocl.core.engines.opencl import OpenCLEngine
+from lnocl.core.opencl.device import choose, describe
+from lnocl.core.runs.start import Setup, make_start
+from lnocl.core.scene.penalty import Penalty
+from lnocl.core.scene.rotation import Rotation
+from lnocl.core.scene.transforms import rotation
 
 FREQUENCIES = (0.02, 0.05, 0.1, 0.15, 0.2, 0.25, 0.3, 0.35, 0.4)
 DEGREES = (-45.0, -20.0, 1.0, 10.0, 33.0, 45.0)

@@ -1,6 +1,6 @@
 /* The one header for precision, and for what the host fixes when it builds.
  *
- * Constants given by the host (lnocl/opencl/program.py):
+ * Constants given by the host (lnocl/core/opencl/program.py):
  *   REAL, BITS      float and int, or double and long
  *   LANES           reals in a vector: 16, 8, 4, 2 or 1
  *   BLOCK           columns, or pairs of rows, transformed together; a multiple of LANES

@@ -1,5 +1,5 @@
 /* Images that are turned against the sky: three shears, the first along x, the second along y, the
- * third along x again (lnocl/scene/rotation.py). convolve.cl does the first, as phases of the rows.
+ * third along x again (lnocl/core/scene/rotation.py). convolve.cl does the first, as phases of the rows.
  * Here the others shift lines by TURN_TAPS weights each.
  *
  * Between the kernels the pixels of one image lie so that a shift along y is a shift in memory:

@@ -15,16 +15,16 @@ loading.begin()  # before what takes its time
 # ruff: noqa: E402
 from importlib.metadata import version
 
+from lnocl.core.runs.plan import Plan, plan
+from lnocl.core.scene.observation import Observation
+from lnocl.core.scene.psf_field import PsfField
+from lnocl.core.scene.transforms import rotations
 from lnocl.deconvolution import deconvolve
 from lnocl.errors import DeviceError as DeviceError
 from lnocl.errors import FileError as FileError
 from lnocl.errors import InputError as InputError
 from lnocl.errors import LnoclError, LnoclWarning
 from lnocl.result import Result
-from lnocl.runs.plan import Plan, plan
-from lnocl.scene.observation import Observation
-from lnocl.scene.psf_field import PsfField
-from lnocl.scene.transforms import rotations
 from lnocl.tiles import deconvolve_tiles
 
 __all__ = [

@@ -13,13 +13,13 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
+from lnocl.core.runs.held_out import HeldOutCounts
+from lnocl.core.runs.inputs import WIDTH, digest_of
+from lnocl.core.runs.run import Run
+from lnocl.core.runs.stopping import Rule
+from lnocl.core.solvers.engine import State
 from lnocl.errors import FileError, InputError, warn
 from lnocl.io.atomic import check_output, whole_file
-from lnocl.runs.held_out import HeldOutCounts
-from lnocl.runs.inputs import WIDTH, digest_of
-from lnocl.runs.run import Run
-from lnocl.runs.stopping import Rule
-from lnocl.solvers.engine import State
 
 # Seconds between two checkpoints.
 EVERY = 60.0

@@ -12,25 +12,25 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from lnocl.checkpoint import Checkpointer
-from lnocl.errors import note
-from lnocl.reconstruction import reconstruct
-from lnocl.result import Callback, Result, make_result
-from lnocl.result.verdict import warn_of_faults
-from lnocl.runs.inputs import describe
-from lnocl.runs.options import (
+from lnocl.core.runs.inputs import describe
+from lnocl.core.runs.options import (
     EngineName,
     Precision,
     StopName,
     check_types,
 )
-from lnocl.runs.outcome import Outcome
-from lnocl.runs.plan import HALOS, LEVELS, PSFS, STARS, Plan
-from lnocl.runs.plan import plan as make_plan
-from lnocl.runs.preparation import Prepared, prepare, quietly
-from lnocl.runs.progress import Progress
-from lnocl.scene.observation import Observation
-from lnocl.scene.psf_families import Family
-from lnocl.solvers import SolverName
+from lnocl.core.runs.outcome import Outcome
+from lnocl.core.runs.plan import HALOS, LEVELS, PSFS, STARS, Plan
+from lnocl.core.runs.plan import plan as make_plan
+from lnocl.core.runs.preparation import Prepared, prepare, quietly
+from lnocl.core.runs.progress import Progress
+from lnocl.core.scene.observation import Observation
+from lnocl.core.scene.psf_families import Family
+from lnocl.core.solvers import SolverName
+from lnocl.errors import note
+from lnocl.reconstruction import reconstruct
+from lnocl.result import Callback, Result, make_result
+from lnocl.result.verdict import warn_of_faults
 
 
 def deconvolve(
@@ -91,13 +91,14 @@ def deconvolve(
         Positions of the n point sources in pixels of an image without offset, 0-based, x along
         columns. Two stars must lie a thousandth of a pixel apart or more. They may be a Quantity in
         pixels, or a table with columns x and y, or as photutils or SExtractor name them
-        (`lnocl.scene.star_tables.IN_PIXELS`). SExtractor counts from 1, and is converted. Between
-        pixels a star's image is the PSF moved in its spectrum (`lnocl.scene.shifting.place`).
+        (`lnocl.core.scene.star_tables.IN_PIXELS`). SExtractor counts from 1, and is converted.
+        Between pixels a star's image is the PSF moved in its spectrum
+        (`lnocl.core.scene.shifting.place`).
     mu : float, optional
         Weight of the Tikhonov term on the extended source, per electron, zero or more.
     smoothing : float or "auto", optional
-        Weight of an edge-preserving term against noise (`lnocl.scene.penalty.Penalty`), zero or
-        more, or "auto", that which suits the noise of the counts.
+        Weight of an edge-preserving term against noise (`lnocl.core.scene.penalty.Penalty`), zero
+        or more, or "auto", that which suits the noise of the counts.
 
         The weight is λ in the objective, without unit. The length δ is three times the mean of the
         extended source. The term keeps the noise down that grows with the iterations, most of all
@@ -130,17 +131,17 @@ def deconvolve(
         Where the iterations are computed: OpenCL, or the plain NumPy reference.
     device : str, optional
         OpenCL device as ``PLATFORM[:DEVICE]``, each an index or a part of the name, as ``lnocl
-        devices`` lists them (see `lnocl.opencl.device.choose`). By default that of the environment
-        variable PYOPENCL_CTX, else the first GPU, else the first CPU.
+        devices`` lists them (see `lnocl.core.opencl.device.choose`). By default that of the
+        environment variable PYOPENCL_CTX, else the first GPU, else the first CPU.
     pad : int or "auto", optional
         Smallest number of unobserved pixels round the images. "auto": where light runs over the
         edge as many as the PSFs need, else 0.
 
         They need the radius that holds nine tenths of their light, at most half the shorter side
         (:doc:`/validation/frames`). Each axis of the grid is then the next of
-        `lnocl.scene.grid.LENGTHS`: powers of two, and 3, 5, 7 or 9 times one from 16 up. It is at
-        least as long as the PSFs or twice the images. The model is periodic where images have such
-        lengths, PSFs are no larger, and ``pad=0``.
+        `lnocl.core.scene.grid.LENGTHS`: powers of two, and 3, 5, 7 or 9 times one from 16 up. It is
+        at least as long as the PSFs or twice the images. The model is periodic where images have
+        such lengths, PSFs are no larger, and ``pad=0``.
     initial_extended : array_like, of the shape of the result's, optional
         Extended source to start from, not 0 everywhere; by default flat. Pixels that start at 0
         stay 0 with "sgm". One that is far brighter than the images, as in another unit, is made as
@@ -163,7 +164,7 @@ def deconvolve(
         "auto".
 
         Fisher scoring of all fluxes and positions moves the stars, with the extended source held
-        fixed (`lnocl.solvers.positions`). It runs at the start and after 3, 6, 12, 24 ...
+        fixed (`lnocl.core.solvers.positions`). It runs at the start and after 3, 6, 12, 24 ...
         iterations. See Notes.
     refine_psfs : iterable of {"shift", "jitter", "strehl", "pupil", "modes", "pixels"}, or "auto"
         What is fitted of PSFs to the stars before the reconstruction, where they do not fit: shift,
@@ -242,9 +243,9 @@ def deconvolve(
     **Held-out counts** are cross-validation by data thinning. The counts are split at random into
     two halves, independent observations of the same sky. Both are reconstructed side by side. The
     error of their sum is estimated from the products of one's estimates with the other's
-    (`lnocl.runs.assessment` has the equation). The last iteration with an error within a tenth of
-    the least is chosen, and the halves run to twice that iteration. The result is the sum of their
-    extended sources and star fluxes at the chosen iteration, and the mean of their positions.
+    (`lnocl.core.runs.assessment` has the equation). The last iteration with an error within a tenth
+    of the least is chosen, and the halves run to twice that iteration. The result is the sum of
+    their extended sources and star fluxes at the chosen iteration, and the mean of their positions.
 
     That takes about four times as long as a run whose iteration is known. It takes the memory of
     two runs and of about twenty estimates of each. Where smoothing is "auto" the halves then
@@ -255,12 +256,12 @@ def deconvolve(
     **Stars have a prior** in the halves where smoothing is "auto". What lies under a star the
     extended source may take over at almost no price, and the more light it has, the smaller is its
     relative error. So a run with a fixed weight comes first, until the objective settles. The star
-    fluxes that it tells, and their errors by `lnocl.solvers.star_errors`, are a Gaussian prior
-    (`lnocl.runs.steady`). Where held-out counts choose an iteration of more than four fifths of
-    `n_iter`, that run is the result, and a warning says so.
+    fluxes that it tells, and their errors by `lnocl.core.solvers.star_errors`, are a Gaussian prior
+    (`lnocl.core.runs.steady`). Where held-out counts choose an iteration of more than four fifths
+    of `n_iter`, that run is the result, and a warning says so.
 
-    **Refined PSFs** have parameters of these kinds (`lnocl.scene.psf_families`,
-    `lnocl.solvers.psf_fit`):
+    **Refined PSFs** have parameters of these kinds (`lnocl.core.scene.psf_families`,
+    `lnocl.core.solvers.psf_fit`):
 
     - "shift", the place of the PSF;
     - "jitter", the covariance of a blur;
@@ -272,13 +273,13 @@ def deconvolve(
     **PSFs that do not fit** leave light beside a star, and an extended source that is free there
     takes it up. So PSFs are judged by short runs in a window round the stars. In these the
     extended source is smoothed near the stars as strongly as the PSFs' own error asks for, which
-    the residuals at the stars show (`lnocl.scene.psf_misfit`, `lnocl.runs.guarded_runs`). Where
-    their chi squared exceeds its expectation by five standard deviations, or by three and the error
-    is above 0.025, positions and PSFs are refined as far as they may be. They are used where they
-    take two standard deviations or more, and leave less than half of the error, or nothing that
-    noise does not explain. Free pixels, which may fit anything, are used where they leave less than
-    0.3 of it, and change no star's flux by more than κ. Read noise that is larger than the images
-    show is lowered for all this.
+    the residuals at the stars show (`lnocl.core.scene.psf_misfit`, `lnocl.core.runs.guarded_runs`).
+    Where their chi squared exceeds its expectation by five standard deviations, or by three and the
+    error is above 0.025, positions and PSFs are refined as far as they may be. They are used where
+    they take two standard deviations or more, and leave less than half of the error, or nothing
+    that noise does not explain. Free pixels, which may fit anything, are used where they leave less
+    than 0.3 of it, and change no star's flux by more than κ. Read noise that is larger than the
+    images show is lowered for all this.
 
     What is left, a relative error κ of the PSFs, adds to λ twice the standard deviation of the data
     term's gradient by it, ``2 sqrt(sum_j (A_j^2)^T (κ S_j / m_j)^2)``, with S_j the starlight. So
@@ -296,12 +297,12 @@ def deconvolve(
     **Star fluxes are marginal** where PSFs were judged and fit. What lies under a star belongs to
     it or to the extended source, and early iterations leave it to the star. So after the last
     iteration each star takes a step of Newton to the flux that the counts give it with the extended
-    source marginalised (`lnocl.solvers.marginal`). The extended source takes up what stars lose.
-    A callback and the history have the iterations as they were.
+    source marginalised (`lnocl.core.solvers.marginal`). The extended source takes up what stars
+    lose. A callback and the history have the iterations as they were.
 
     **Levels** of backgrounds with a `background_error` are fitted after a short run, and again at
-    the end, with a gradient (`lnocl.solvers.levels`). Their errors are in those of star fluxes and
-    of the extended source. Where `smoothing` is a number levels stay, with the errors as given.
+    the end, with a gradient (`lnocl.core.solvers.levels`). Their errors are in those of star fluxes
+    and of the extended source. Where `smoothing` is a number levels stay, with the errors as given.
 
     **The split-gradient method** lowers the objective at every iteration where PSFs are not
     negative. With many negative pixels, as in a raw frame of a star, the objective may rise again.

@@ -12,9 +12,9 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike
 
+from lnocl.core.scene.arrays import Array, unmasked
+from lnocl.core.scene.quantities import bare, in_unit, split
 from lnocl.errors import InputError
-from lnocl.scene.arrays import Array, unmasked
-from lnocl.scene.quantities import bare, in_unit, split
 
 N_STAR_ROWS = 24
 

@@ -8,21 +8,21 @@ from dataclasses import replace
 from functools import partial
 
 from lnocl.checkpoint import Checkpointer
+from lnocl.core.runs.halves import Halves
+from lnocl.core.runs.held_out import HeldOutCounts
+from lnocl.core.runs.options import warn_of_rounding
+from lnocl.core.runs.outcome import Outcome
+from lnocl.core.runs.preparation import Prepared, quietly
+from lnocl.core.runs.progress import Progress
+from lnocl.core.runs.run import Run
+from lnocl.core.runs.start import Start, make_start
+from lnocl.core.runs.steady import run_steadily, told_prior
+from lnocl.core.runs.stopping import Rule, make_rule
+from lnocl.core.scene.noise_check import warn_of_noise
+from lnocl.core.scene.penalty import Penalty
+from lnocl.core.scene.star_check import warn_of_stars
 from lnocl.errors import DivergedError, NotFiniteError, warn
 from lnocl.result import Callback, Estimate, Iterating
-from lnocl.runs.halves import Halves
-from lnocl.runs.held_out import HeldOutCounts
-from lnocl.runs.options import warn_of_rounding
-from lnocl.runs.outcome import Outcome
-from lnocl.runs.preparation import Prepared, quietly
-from lnocl.runs.progress import Progress
-from lnocl.runs.run import Run
-from lnocl.runs.start import Start, make_start
-from lnocl.runs.steady import run_steadily, told_prior
-from lnocl.runs.stopping import Rule, make_rule
-from lnocl.scene.noise_check import warn_of_noise
-from lnocl.scene.penalty import Penalty
-from lnocl.scene.star_check import warn_of_stars
 
 
 def reconstruct(
@@ -37,7 +37,8 @@ def reconstruct(
     ----------
     prepared : Prepared
         The parameters. With its steady penalty a run goes before, whose star fluxes are the prior
-        of the others (`lnocl.runs.steady`); it is the outcome where held-out counts find no end.
+        of the others (`lnocl.core.runs.steady`); it is the outcome where held-out counts find no
+        end.
     callback, progress
         As for `deconvolve`.
     checkpointer : Checkpointer, optional
@@ -52,7 +53,7 @@ def reconstruct(
         with Progress(None, "", bool(progress), "measuring steps", stays=False):
             start = make_start(setup, penalties[0])
             if setup.settles_halos:
-                from lnocl.runs.halos import settle_halos  # which loads scipy
+                from lnocl.core.runs.halos import settle_halos  # which loads scipy
 
                 start = settle_halos(start)
         warn_of_noise(setup.observation)
@@ -95,7 +96,7 @@ def _choose(
 
 
 def _run_steadily(start: Start, penalty: Penalty, n_iter: int, progress: bool) -> Outcome | None:
-    """Return that of `lnocl.runs.steady.run_steadily`; None where its objective rises."""
+    """Return that of `lnocl.core.runs.steady.run_steadily`; None where its objective rises."""
     fitting = Progress(n_iter, "it", bool(progress), "fitting the stars", stays=False)
     with fitting, suppress(DivergedError, NotFiniteError):  # of which the halves tell
         return run_steadily(start, penalty, n_iter, fitting.update)

@@ -9,11 +9,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from lnocl.scene.arrays import Array
-from lnocl.scene.cores import fwhm
-from lnocl.scene.detector import on_sky, seen_psfs
-from lnocl.scene.estimate import Estimate
-from lnocl.scene.observation import Observation
+from lnocl.core.scene.arrays import Array
+from lnocl.core.scene.cores import fwhm
+from lnocl.core.scene.detector import on_sky, seen_psfs
+from lnocl.core.scene.estimate import Estimate
+from lnocl.core.scene.observation import Observation
 
 # The core of a star is where its PSF is above this share of its peak; its wings go on to the other.
 CORE, WINGS = 0.5, 1e-3
@@ -238,7 +238,7 @@ def _fits_at(estimate: Estimate, j: int, psf: Array, position: Array) -> tuple[F
     """Return the fit in the core and in the wings of a star in one image, whose PSF is given."""
     from astropy.nddata import NoOverlapError, overlap_slices
 
-    from lnocl.scene.view import View, Window  # which load scipy
+    from lnocl.core.scene.view import View, Window  # which load scipy
 
     scene, observation = estimate.scene, estimate.scene.observation
     y, x = np.nonzero(psf > WINGS * psf.max())

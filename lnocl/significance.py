@@ -16,17 +16,17 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from lnocl.core.runs.outcome import Outcome
+from lnocl.core.scene.arrays import Array, number_in, whole
+from lnocl.core.scene.detector import on_sky
+from lnocl.core.scene.quantities import in_unit
+from lnocl.core.scene.texture import SHARE_NEAR
+from lnocl.core.solvers.halos import halo_errors
 from lnocl.detection.point_test import point_flux
 from lnocl.detection.score import Null
 from lnocl.detection.score_map import ScoreMap
 from lnocl.errors import InputError
 from lnocl.plotting.significance import SignificanceView, draw_significance
-from lnocl.runs.outcome import Outcome
-from lnocl.scene.arrays import Array, number_in, whole
-from lnocl.scene.detector import on_sky
-from lnocl.scene.quantities import in_unit
-from lnocl.scene.texture import SHARE_NEAR
-from lnocl.solvers.halos import halo_errors
 
 if TYPE_CHECKING:
     from astropy.table import QTable
@@ -221,8 +221,8 @@ class Significance:
         from astropy.table import QTable
         from astropy.units import electron, pix
 
-        from lnocl.runs.injections import APART, Injections, spread_places
-        from lnocl.runs.progress import Progress
+        from lnocl.core.runs.injections import APART, Injections, spread_places
+        from lnocl.core.runs.progress import Progress
 
         check_injections(n, seed)
         limits, observation = self.limit(completeness), self._outcome.observation
@@ -262,7 +262,7 @@ class Significance:
     def _told_from_source(self) -> Array:
         """The flux of a point that is told from the extended source, where there is any.
 
-        That varies by as much as `lnocl.scene.texture` expects of the brightest round a star.
+        That varies by as much as `lnocl.core.scene.texture` expects of the brightest round a star.
         """
         if self._map.width:
             return np.zeros(self._map.values.shape)

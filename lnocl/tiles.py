@@ -12,6 +12,19 @@ from typing import Any, Literal, NamedTuple, cast
 import numpy as np
 from numpy.typing import NDArray
 
+from lnocl.core.runs.options import StopName, check_observation
+from lnocl.core.runs.outcome import Outcome
+from lnocl.core.runs.plan import Plan
+from lnocl.core.runs.plan import plan as make_plan
+from lnocl.core.runs.preparation import Prepared, prepare
+from lnocl.core.runs.progress import Progress
+from lnocl.core.scene.arrays import Array, together, whole
+from lnocl.core.scene.counts import mean_exposure, means
+from lnocl.core.scene.grid import psf_shape
+from lnocl.core.scene.observation import Observation
+from lnocl.core.scene.padding import recommend_pad
+from lnocl.core.scene.scaled_penalty import EDGE
+from lnocl.core.scene.scene import Scene
 from lnocl.errors import InputError, LnoclWarning, counted, warn
 from lnocl.parallel import Parallel, check_parallel, work
 from lnocl.process import ignored_warnings, recorded_warnings
@@ -19,19 +32,6 @@ from lnocl.reconstruction import reconstruct
 from lnocl.residuals import StarResiduals
 from lnocl.result import Result, make_result
 from lnocl.result.verdict import warn_of_faults
-from lnocl.runs.options import StopName, check_observation
-from lnocl.runs.outcome import Outcome
-from lnocl.runs.plan import Plan
-from lnocl.runs.plan import plan as make_plan
-from lnocl.runs.preparation import Prepared, prepare
-from lnocl.runs.progress import Progress
-from lnocl.scene.arrays import Array, together, whole
-from lnocl.scene.counts import mean_exposure, means
-from lnocl.scene.grid import psf_shape
-from lnocl.scene.observation import Observation
-from lnocl.scene.padding import recommend_pad
-from lnocl.scene.scaled_penalty import EDGE
-from lnocl.scene.scene import Scene
 from lnocl.tiling import Span, Tile, cut, lay
 
 # Of those of `lnocl.deconvolve`, beside parameters.
@@ -324,7 +324,7 @@ def _outcome(prepared: Prepared, tile: Tile) -> Outcome:
 
 
 def _solve(prepared: Prepared, tile: Tile) -> _Found:
-    from lnocl.solvers.light import Light  # which loads scipy
+    from lnocl.core.solvers.light import Light  # which loads scipy
 
     tile = tile.without_unseen_neighbours()
     begins = "tile that begins at pixel ({1}, {0}), where positions there begin".format(

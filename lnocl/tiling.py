@@ -9,14 +9,14 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from lnocl.core.scene.arrays import Array, whole
+from lnocl.core.scene.geometry import Box
+from lnocl.core.scene.grid import length_for, psf_shape
+from lnocl.core.scene.observation import Observation
+from lnocl.core.scene.scene import Scene
+from lnocl.core.scene.transforms import part as part_of
 from lnocl.errors import InputError
 from lnocl.process import ignored_warnings
-from lnocl.scene.arrays import Array, whole
-from lnocl.scene.geometry import Box
-from lnocl.scene.grid import length_for, psf_shape
-from lnocl.scene.observation import Observation
-from lnocl.scene.scene import Scene
-from lnocl.scene.transforms import part as part_of
 
 # The side of a tile in those of the PSFs, where these vary: docs/validation/tiles.md.
 SIDES = 5
@@ -87,7 +87,7 @@ class Tile(NamedTuple):
     core : tuple of slice
         The pixels in the window of the extended source that it stands for.
     near_stars : ndarray of float64 or None
-        As of `lnocl.scene.penalty.Penalty`, in its window.
+        As of `lnocl.core.scene.penalty.Penalty`, in its window.
     """
 
     spans: tuple[Span, Span]

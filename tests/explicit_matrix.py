@@ -8,8 +8,8 @@ import numpy as np
 from scipy.optimize import minimize
 from scipy.special import kl_div
 
-from lnocl.scene.penalty import Penalty
-from lnocl.scene.scene import Scene
+from lnocl.core.scene.penalty import Penalty
+from lnocl.core.scene.scene import Scene
 
 
 class Problem:

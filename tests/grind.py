@@ -17,10 +17,10 @@ import pyopencl as cl
 from kernel_scenes import FOUR_TIMES_AS_FINE, SCENES
 from scenes import Recipe, worst
 
+from lnocl.core.opencl import launch, program
+from lnocl.core.opencl.device import choose
+from lnocl.core.opencl.tuning import Tuning
 from lnocl.errors import MisfitWarning
-from lnocl.opencl import launch, program
-from lnocl.opencl.device import choose
-from lnocl.opencl.tuning import Tuning
 
 DTYPES = {"s": np.float32, "d": np.float64}
 

@@ -10,9 +10,9 @@ from kernel_comparison import ALLOWED, deviation, kernels_of
 from kernel_harness import THREE_IMAGES, TURNED, TWICE_AS_FINE, KernelHarness, inputs
 from kernel_scenes import FOUR_TIMES_AS_FINE, SCENES
 
-from lnocl.opencl import sources
-from lnocl.opencl.device import choose, context_of
-from lnocl.opencl.tuning import Tuning
+from lnocl.core.opencl import sources
+from lnocl.core.opencl.device import choose, context_of
+from lnocl.core.opencl.tuning import Tuning
 
 
 def of_gpu(*grid, oversample=1, dtype=np.float32):

@@ -1,4 +1,4 @@
-"""Every kernel against its twin in `lnocl.reference`, on random arrays, on any device."""
+"""Every kernel against its twin in `lnocl.core.reference`, on random arrays, on any device."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ import pyopencl as cl
 from kernel_harness import KernelHarness, Windows, rounded
 from numpy.typing import ArrayLike, NDArray
 
-from lnocl import reference
+from lnocl.core import reference
+from lnocl.core.opencl.layout import reversed_order
+from lnocl.core.opencl.shears import Shears
 from lnocl.errors import DeviceError
-from lnocl.opencl.layout import reversed_order
-from lnocl.opencl.shears import Shears
 
 # What a kernel made, and what its twin made of the same.
 Pairs = Iterator[tuple[NDArray, NDArray]]

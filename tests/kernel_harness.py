@@ -11,15 +11,15 @@ import numpy as np
 import pyopencl as cl
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
+from lnocl.core.opencl.launch import READ_WRITE, Launcher
+from lnocl.core.opencl.layout import Layout, PixelLayout, reversed_order
+from lnocl.core.opencl.program import Program
+from lnocl.core.opencl.shears import Shears
+from lnocl.core.opencl.tuning import Tuning
+from lnocl.core.opencl.windows import stars_near
+from lnocl.core.scene.rotation import Rotation
+from lnocl.core.scene.scene import MIN_MODEL
 from lnocl.errors import DeviceError
-from lnocl.opencl.launch import READ_WRITE, Launcher
-from lnocl.opencl.layout import Layout, PixelLayout, reversed_order
-from lnocl.opencl.program import Program
-from lnocl.opencl.shears import Shears
-from lnocl.opencl.tuning import Tuning
-from lnocl.opencl.windows import stars_near
-from lnocl.scene.rotation import Rotation
-from lnocl.scene.scene import MIN_MODEL
 
 # Scenes with all parts, together, that a program can have.
 THREE_IMAGES = "three images, two stars, mask, background map, map of smoothing"
@@ -159,9 +159,9 @@ class KernelHarness:
     context : pyopencl.Context
         Of one device.
     grid, dtype, tuning
-        Grid of the sky; as for `lnocl.opencl.program.Program`.
+        Grid of the sky; as for `lnocl.core.opencl.program.Program`.
     **scene
-        Parts of the scene, as for `lnocl.opencl.program.Program`, n_images and n_stars: one of
+        Parts of the scene, as for `lnocl.core.opencl.program.Program`, n_images and n_stars: one of
         `SCENES`.
     """
 

@@ -8,7 +8,7 @@ import os
 
 import pytest
 
-from lnocl.opencl import program
+from lnocl.core.opencl import program
 
 MAX_PROGRAMS = 16
 FAST = "not exhaustive and not system"

@@ -2,7 +2,7 @@
 
 import pytest
 
-from lnocl.opencl import device
+from lnocl.core.opencl import device
 
 on_pocl = pytest.mark.skipif(
     device.choose().device.platform.name != "Portable Computing Language",

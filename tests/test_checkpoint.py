@@ -11,8 +11,8 @@ from scenes import ENGINES, Recipe, make_smooth_psfs, paper
 
 import lnocl
 from lnocl import checkpoint
-from lnocl.engines.numpy import ReferenceEngine
-from lnocl.runs.run import FIRST_REFINED, Run
+from lnocl.core.engines.numpy import ReferenceEngine
+from lnocl.core.runs.run import FIRST_REFINED, Run
 
 STARS = Recipe((16, 32), 2, 2, mu=1e-3, smoothing=0.01, masked=0.05)
 NO_STAR = Recipe((16, 32), 1)

@@ -6,8 +6,8 @@ from astropy import units as u
 from scenes import paper, same
 
 import lnocl
-from lnocl.scene.padding import recommend_pad
-from lnocl.scene.penalty import recommend_smoothing
+from lnocl.core.scene.padding import recommend_pad
+from lnocl.core.scene.penalty import recommend_smoothing
 
 OBSERVATION = lnocl.Observation(np.full((8, 8), 5.0), np.ones((1, 1)), background=1.0)
 

@@ -7,10 +7,10 @@ import pytest
 from scenes import Recipe, make_smooth_psfs, paper
 
 import lnocl
+from lnocl.core.scene.estimate import Estimate
+from lnocl.core.scene.scene import Scene
+from lnocl.core.scene.shifting import place
 from lnocl.residuals import CORE, WINGS, Fit, _halo, judge, judge_stars, residuals, sharp_sources
-from lnocl.scene.estimate import Estimate
-from lnocl.scene.scene import Scene
-from lnocl.scene.shifting import place
 
 # The PSFs are cut off.
 pytestmark = pytest.mark.filterwarnings("ignore:psf . is sharper than its pixels")

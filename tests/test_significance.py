@@ -8,10 +8,10 @@ import pytest
 from scipy import ndimage
 
 import lnocl
+from lnocl.core.runs.injections import Injections, spread_places
 from lnocl.detection.point_test import point_flux
 from lnocl.errors import InputError
 from lnocl.process import ignored_warnings
-from lnocl.runs.injections import Injections, spread_places
 from lnocl.significance import significance
 
 ROWS, COLUMNS = np.indices((33, 33)) - 16

@@ -16,8 +16,8 @@ import lnocl
 from lnocl import PsfField, tiles, tiling
 from lnocl.commands import cli
 from lnocl.commands.deconvolve import in_tiles
+from lnocl.core.scene.shifting import MovablePsf
 from lnocl.errors import InputError
-from lnocl.scene.shifting import MovablePsf
 
 HALF = 10
 Y, X = np.mgrid[-HALF : HALF + 1, -HALF : HALF + 1].astype(float)

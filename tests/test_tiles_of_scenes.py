@@ -10,8 +10,8 @@ from turned_scenes import COVARIANCES, gaussian, psf
 
 import lnocl
 from lnocl import tiles, tiling
-from lnocl.scene.estimate import Estimate
-from lnocl.scene.scene import Scene
+from lnocl.core.scene.estimate import Estimate
+from lnocl.core.scene.scene import Scene
 
 SHAPE = 40, 56
 # Of the image whose pixels are larger.

@@ -7,10 +7,10 @@ import pyopencl as cl
 from kernel_harness import SpectraLayout
 from numpy.typing import NDArray
 
-from lnocl.opencl.launch import READ_WRITE, Launch, Launcher
-from lnocl.opencl.layout import reversed_order
-from lnocl.opencl.program import Program
-from lnocl.opencl.tuning import Tuning
+from lnocl.core.opencl.launch import READ_WRITE, Launch, Launcher
+from lnocl.core.opencl.layout import reversed_order
+from lnocl.core.opencl.program import Program
+from lnocl.core.opencl.tuning import Tuning
 
 
 class Transform:
@@ -21,11 +21,11 @@ class Transform:
     context : pyopencl.Context
         Of one device.
     grid : tuple of int
-        Shape (Ny, Nx), of `lnocl.scene.grid.LENGTHS`.
+        Shape (Ny, Nx), of `lnocl.core.scene.grid.LENGTHS`.
     dtype : numpy.dtype
         float32 or float64.
     tuning : Tuning, optional
-        By default that of `lnocl.opencl.tuning.tune`.
+        By default that of `lnocl.core.opencl.tuning.tune`.
     """
 
     def __init__(

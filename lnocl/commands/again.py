@@ -18,9 +18,9 @@ from lnocl.process import ignored_notes, ignored_warnings
 from lnocl.result.kept import from_parts
 
 if TYPE_CHECKING:
+    from lnocl.core.runs.outcome import Outcome
     from lnocl.io.frames import Frames
     from lnocl.io.saved_results import SavedResult
-    from lnocl.runs.outcome import Outcome
 
 # The run is taken for the same where pixels and fluxes are to this share of them, and pixels to
 # this share of the brightest: another device rounds otherwise.

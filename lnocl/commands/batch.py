@@ -255,9 +255,9 @@ def _write_log(folder: Folder, record: Record, log: str) -> None:
 
 
 def _run(arguments: argparse.Namespace) -> Iterator[str]:
+    from lnocl.core.runs.progress import Progress
     from lnocl.io import atomic
     from lnocl.parallel import check_parallel
-    from lnocl.runs.progress import Progress
 
     check_parallel(arguments.parallel)
     targets = read_targets(arguments.targets)

@@ -42,9 +42,9 @@ OPTIONS = [
 
 
 def _run(arguments: argparse.Namespace) -> Iterator[str]:
+    from lnocl.core.opencl import device
     from lnocl.io.calibration import Calibration
     from lnocl.io.frames import read_frames
-    from lnocl.opencl import device
     from lnocl.studies import bench
 
     images, psfs, size = arguments.images, arguments.psfs or [], arguments.size

@@ -12,22 +12,22 @@ from lnocl.commands import checkpoints, messages, options, pictures, record
 from lnocl.commands.deconvolve_options import ALL_OPTIONS, OPTIONS, PARAMETERS
 from lnocl.commands.parser import Command
 from lnocl.commands.summary import summarise
+from lnocl.core.runs.progress import Progress
 from lnocl.deconvolution import deconvolve
 from lnocl.errors import InputError, warn
 from lnocl.result import Callback, Result, view_of
-from lnocl.runs.progress import Progress
 
 if TYPE_CHECKING:
+    from lnocl.core.scene.observation import Observation
     from lnocl.io.frames import Frames
-    from lnocl.scene.observation import Observation
 
 
 def read(arguments: argparse.Namespace) -> tuple[Frames, dict[str, Any]]:
     """Read what the arguments of ``lnocl deconvolve`` name; return it, and the values given."""
+    from lnocl.core.scene.uncertainties import OtherNoiseError
     from lnocl.io import missions
     from lnocl.io.calibration import Calibration
     from lnocl.io.frames import read_frames
-    from lnocl.scene.uncertainties import OtherNoiseError
 
     given = {**vars(arguments), "device": _device_spec(arguments)}
     given |= missions.calibrate(arguments.images[0], given)
@@ -177,7 +177,7 @@ def _repeated(given: Mapping[str, Any], frames: Frames) -> dict[str, Any]:
 
 def _used(repeated: Mapping[str, Any], frames: Frames, result: Result) -> dict[str, Any]:
     """Return the values that were computed with, where rules and keywords were given."""
-    from lnocl.scene.padding import choose_pad
+    from lnocl.core.scene.padding import choose_pad
 
     exposure = frames.observation.exposure
     return {
@@ -202,7 +202,7 @@ def _device_spec(arguments: argparse.Namespace) -> str | None:
     """Return the OpenCL device as indices, so that the run can be repeated on the same."""
     if arguments.engine != "opencl":
         return arguments.device
-    from lnocl.opencl import device
+    from lnocl.core.opencl import device
 
     return device.spec_of(device.choose(arguments.device).device)
 

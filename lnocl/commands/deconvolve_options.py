@@ -7,12 +7,12 @@ import inspect
 from lnocl.commands import options
 from lnocl.commands.declared import BACKGROUND, DEVICE, READ_NOISE, SATURATION, parameter
 from lnocl.commands.options import option
+from lnocl.core.scene.fields import OVERSAMPLES
+from lnocl.core.scene.observation import Observation
+from lnocl.core.scene.psf_families import FAMILIES
 from lnocl.deconvolution import deconvolve
 from lnocl.io.calibration import Calibration
 from lnocl.io.names import NOISE, PSF_ERRORS, STAR_PSFS
-from lnocl.scene.fields import OVERSAMPLES
-from lnocl.scene.observation import Observation
-from lnocl.scene.psf_families import FAMILIES
 
 PARAMETERS = {
     name: declared.default for name, declared in inspect.signature(deconvolve).parameters.items()

@@ -31,7 +31,7 @@ def _parse(command: Command, words: list[str]) -> argparse.Namespace:
 
 
 def _run(arguments: argparse.Namespace) -> Iterator[str]:
-    from lnocl.opencl import device, trial
+    from lnocl.core.opencl import device, trial
     from lnocl.studies import demo
 
     chosen = device.choose(arguments.device).device

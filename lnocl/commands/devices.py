@@ -13,8 +13,8 @@ from lnocl.commands.parser import Command
 def _run(arguments: argparse.Namespace) -> Iterator[str]:
     import numpy as np
 
-    from lnocl.opencl import device, trial
-    from lnocl.opencl.tuning import describe_tuning
+    from lnocl.core.opencl import device, trial
+    from lnocl.core.opencl.tuning import describe_tuning
 
     if arguments.tune:
         yield from _tune(arguments.device)
@@ -28,8 +28,8 @@ def _run(arguments: argparse.Namespace) -> Iterator[str]:
 
 
 def _tune(spec: str | None) -> Iterator[str]:
-    from lnocl.opencl.device import choose, describe
-    from lnocl.opencl.tuning import in_words, store
+    from lnocl.core.opencl.device import choose, describe
+    from lnocl.core.opencl.tuning import in_words, store
     from lnocl.studies import tuning
 
     device = choose(spec).device

@@ -18,18 +18,18 @@ from lnocl.commands.messages import MAX_LISTED
 from lnocl.commands.options import option
 from lnocl.commands.parser import Command
 from lnocl.commands.running import written_as_done
+from lnocl.core.scene.apertures import Aperture
 from lnocl.errors import FileError, InputError, note
 from lnocl.process import ignored_notes
 from lnocl.result import Result
-from lnocl.scene.apertures import Aperture
 
 if TYPE_CHECKING:
     from astropy.table import QTable
 
+    from lnocl.core.runs.bootstrap import Bootstrap, Part
+    from lnocl.core.runs.outcome import Outcome
     from lnocl.io.fitserrors import Held
     from lnocl.io.frames import Frames
-    from lnocl.runs.bootstrap import Bootstrap, Part
-    from lnocl.runs.outcome import Outcome
 
 # Names of quantities of stars and halos; others are of regions and profiles.
 _OF_STARS = re.compile(r"star \d+( epoch \d+)? (flux|x|y)|halo \d+ image \d+")
@@ -58,8 +58,8 @@ OPTIONS = [
 
 
 def _run(arguments: argparse.Namespace) -> list[str]:
+    from lnocl.core.runs.bootstrap import check_number
     from lnocl.parallel import check_parallel
-    from lnocl.runs.bootstrap import check_number
 
     check_parallel(arguments.parallel)
     check_number(arguments.bootstrap, arguments.seed)
@@ -107,8 +107,8 @@ def _add_errors(
     parts : list of Aperture or Profile
         Regions and profiles that are measured.
     """
+    from lnocl.core.runs.bootstrap import bootstrap, without_replicas
     from lnocl.io.fitserrors import read_replicas
-    from lnocl.runs.bootstrap import bootstrap, without_replicas
 
     seed, frames = arguments.seed, again.frames
     latest: list[Bootstrap] = []

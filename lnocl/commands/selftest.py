@@ -11,7 +11,7 @@ from lnocl.commands.parser import Command
 
 
 def _run(arguments: argparse.Namespace) -> Iterator[str]:
-    from lnocl.opencl import device, trial
+    from lnocl.core.opencl import device, trial
     from lnocl.studies import selftest
 
     chosen = device.choose(arguments.device).device

@@ -11,8 +11,8 @@ from lnocl.commands import options, pictures
 from lnocl.commands.declared import SATURATION
 from lnocl.commands.options import option
 from lnocl.commands.parser import Command
+from lnocl.core.scene.arrays import Mask
 from lnocl.errors import counted
-from lnocl.scene.arrays import Mask
 
 if TYPE_CHECKING:
     from astropy.table import Table

@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from lnocl.core.scene.counts import means
+from lnocl.core.scene.observation import Observation
+from lnocl.core.scene.stars import MAX_SHIFT
 from lnocl.errors import counted
 from lnocl.residuals import Fit, sharp_sources
 from lnocl.result import Result
 from lnocl.result.verdict import FITS, in_words
-from lnocl.scene.counts import means
-from lnocl.scene.observation import Observation
-from lnocl.scene.stars import MAX_SHIFT
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

@@ -8,8 +8,8 @@ from itertools import product
 import numpy as np
 from scipy import ndimage
 
-from lnocl.scene.arrays import Array, Mask
-from lnocl.scene.shifting import ENDLESS, MovablePsf
+from lnocl.core.scene.arrays import Array, Mask
+from lnocl.core.scene.shifting import ENDLESS, MovablePsf
 
 # The pairs of pixels on both sides of one: beside it, above and below, and across.
 DIRECTIONS = ((0, 1), (1, 0), (1, 1), (1, -1))

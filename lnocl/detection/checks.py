@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from lnocl.core.scene.arrays import Array, booleans, numbers, values_and_mask
+from lnocl.core.scene.quantities import bare
 from lnocl.errors import InputError
-from lnocl.scene.arrays import Array, booleans, numbers, values_and_mask
-from lnocl.scene.quantities import bare
 
 # Values beyond this have no finite variance in float64.
 LARGEST = 1e150

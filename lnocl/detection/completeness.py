@@ -15,7 +15,7 @@ from collections.abc import Callable
 import numpy as np
 import scipy.special
 
-from lnocl.scene.arrays import Array
+from lnocl.core.scene.arrays import Array
 
 # Rounds of the two fixed points; a value is found to 1e-3 of it.
 ROUNDS, EXACT = 30, 1e-3

@@ -23,7 +23,7 @@ import scipy.special
 from scipy import optimize
 from scipy.interpolate import RegularGridInterpolator
 
-from lnocl.scene.arrays import Array
+from lnocl.core.scene.arrays import Array
 
 # Values that are worth translating, at most and at least.
 LOWEST, HIGHEST = 1.0, 1e4

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from lnocl.scene.arrays import Array
+from lnocl.core.scene.arrays import Array
 
 # The farthest that a point moves in one step, pixels, and the steps in which places are fitted.
 FARTHEST, STEPS = 0.5, 8

@@ -14,13 +14,13 @@ import scipy.linalg
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from lnocl.scene.apertures import FWHM
-from lnocl.scene.arrays import Array
-from lnocl.scene.band_matrix import BandMatrix
-from lnocl.scene.detector import on_sky
-from lnocl.scene.forward_model import Model
-from lnocl.scene.shifting import Cutout, window
-from lnocl.scene.stars import FAINT, Order, StarImages
+from lnocl.core.scene.apertures import FWHM
+from lnocl.core.scene.arrays import Array
+from lnocl.core.scene.band_matrix import BandMatrix
+from lnocl.core.scene.detector import on_sky
+from lnocl.core.scene.forward_model import Model
+from lnocl.core.scene.shifting import Cutout, window
+from lnocl.core.scene.stars import FAINT, Order, StarImages
 
 # Stars and sources share nothing farther apart than so many resolutions.
 APART = 4.0

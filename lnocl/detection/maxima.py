@@ -7,7 +7,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from lnocl.scene.arrays import Array
+from lnocl.core.scene.arrays import Array
 
 # A maximum is a source's where it is so many times its noise, unless another threshold is given.
 SIGNIFICANT = 5.0

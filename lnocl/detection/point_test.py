@@ -1,8 +1,8 @@
 r"""Whether the extended source could be what a place holds, by the least squares of a point there.
 
 A point takes the place of the light of the estimate within a resolution, where the extended source
-is expected to go on inwards as it is round it (`lnocl.scene.texture`). Flux and error follow from
-the least squares of `lnocl.solvers.near_star`, with stars near it, halos and the extended
+is expected to go on inwards as it is round it (`lnocl.core.scene.texture`). Flux and error follow
+from the least squares of `lnocl.core.solvers.near_star`, with stars near it, halos and the extended
 source marginalised.
 """
 
@@ -10,12 +10,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from lnocl.scene.arrays import Array
-from lnocl.scene.detector import on_sky
-from lnocl.scene.estimate import Estimate
-from lnocl.scene.texture import Texture, resolution
-from lnocl.solvers.fluxes import variances
-from lnocl.solvers.near_star import NearStar, Surroundings
+from lnocl.core.scene.arrays import Array
+from lnocl.core.scene.detector import on_sky
+from lnocl.core.scene.estimate import Estimate
+from lnocl.core.scene.texture import Texture, resolution
+from lnocl.core.solvers.fluxes import variances
+from lnocl.core.solvers.near_star import NearStar, Surroundings
 
 # The share of the gradient at which conjugate gradients end.
 FINISHED = 1e-4
@@ -41,7 +41,7 @@ def point_flux(
     moves : bool
         Whether positions of stars are unknown.
     raised : ndarray of float64, shape (n_shapes,)
-        As of `lnocl.solvers.halos.halo_errors`: halos are unknown too.
+        As of `lnocl.core.solvers.halos.halo_errors`: halos are unknown too.
     """
     scene = estimate.scene
     n, n_epochs = scene.n_stars, scene.observation.n_epochs

@@ -34,17 +34,17 @@ import scipy.fft
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from lnocl.core.scene.apertures import FWHM
+from lnocl.core.scene.arrays import Array
+from lnocl.core.scene.estimate import Estimate
+from lnocl.core.scene.forward_model import Model
+from lnocl.core.scene.psf_pixels import CORRELATED
+from lnocl.core.scene.scene import MIN_MODEL
+from lnocl.core.scene.smooth_field import SmoothField
+from lnocl.core.scene.texture import ROUND, coarseness, resolution
 from lnocl.detection.known_stars import KnownStars
 from lnocl.detection.maxima import SIGNIFICANT
 from lnocl.detection.score_noise import noise_of
-from lnocl.scene.apertures import FWHM
-from lnocl.scene.arrays import Array
-from lnocl.scene.estimate import Estimate
-from lnocl.scene.forward_model import Model
-from lnocl.scene.psf_pixels import CORRELATED
-from lnocl.scene.scene import MIN_MODEL
-from lnocl.scene.smooth_field import SmoothField
-from lnocl.scene.texture import ROUND, coarseness, resolution
 
 # Radius of the disc whose level is taken out, in widths of the PSFs, and of a disc for the counts'
 # level over that. Full width of the Gaussian that smooths the estimate, resolutions.

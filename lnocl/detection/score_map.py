@@ -10,13 +10,13 @@ import scipy.linalg
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from lnocl.core.scene.arrays import Array
+from lnocl.core.scene.texture import CORE, ROUND
 from lnocl.detection.completeness import needed, values_at
 from lnocl.detection.false_alarms import Rarity, of_student, threshold
 from lnocl.detection.maxima import peaks
 from lnocl.detection.score import Null
 from lnocl.detection.score_noise import MANY, noise_of
-from lnocl.scene.arrays import Array
-from lnocl.scene.texture import CORE, ROUND
 
 # Sources whose scores are correlated by less than this are apart, and what is left of a variance is
 # no less than its rounding.

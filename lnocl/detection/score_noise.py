@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from scipy import optimize
 from scipy.ndimage import value_indices
 
-from lnocl.scene.arrays import Array, darker_noise
+from lnocl.core.scene.arrays import Array, darker_noise
 
 if TYPE_CHECKING:
     from lnocl.detection.score import Score

@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.spatial import KDTree
 
+from lnocl.core.scene.arrays import Array, darker_noise
+from lnocl.core.scene.cores import centre, fwhm
+from lnocl.core.scene.shifting import ENDLESS, MARGIN, Cutout, MovablePsf
 from lnocl.detection.fitting import STEPS, amounts, fit
 from lnocl.detection.maxima import peaks
-from lnocl.scene.arrays import Array, darker_noise
-from lnocl.scene.cores import centre, fwhm
-from lnocl.scene.shifting import ENDLESS, MARGIN, Cutout, MovablePsf
 
 Window = tuple[slice, slice]
 

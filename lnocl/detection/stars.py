@@ -9,15 +9,15 @@ from numpy.typing import ArrayLike
 from scipy import ndimage
 from scipy.special import erf
 
+from lnocl.core.scene.arrays import Array, Mask, darker_noise
+from lnocl.core.scene.cores import core, fwhm
+from lnocl.core.scene.quantities import in_unit, split
 from lnocl.detection.blemishes import flat_tops, sharp_pixels
 from lnocl.detection.checks import read_image, read_psf
 from lnocl.detection.maxima import SIGNIFICANT
 from lnocl.detection.search import PointSources, around, find_points, in_boxes, pixels_at
 from lnocl.errors import InputError, LnoclError, counted, note, warn
 from lnocl.process import ignored_warnings
-from lnocl.scene.arrays import Array, Mask, darker_noise
-from lnocl.scene.cores import core, fwhm
-from lnocl.scene.quantities import in_unit, split
 
 if TYPE_CHECKING:
     from astropy.table import Table

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Literal, NamedTuple
 
-from lnocl.scene.observation import PsfCentre
+from lnocl.core.scene.observation import PsfCentre
 
 Word = str | float
 

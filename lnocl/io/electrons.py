@@ -9,6 +9,8 @@ from typing import Any
 import numpy as np
 from astropy.units import dimensionless_unscaled
 
+from lnocl.core.scene import units
+from lnocl.core.scene.arrays import Array
 from lnocl.errors import InputError, note, warn
 from lnocl.io.fitsread import read_contents, read_keyword
 from lnocl.io.headers import CONVERTERS
@@ -16,8 +18,6 @@ from lnocl.io.image_files import ImageFiles
 from lnocl.io.levels import is_rate
 from lnocl.io.names import ERR
 from lnocl.io.noise import electrons_by_variance
-from lnocl.scene import units
-from lnocl.scene.arrays import Array
 
 # The keywords that headers have for a gain and an exposure.
 KEYWORDS = {"gain": ("GAIN", "EGAIN", *CONVERTERS), "exposure": ("EXPTIME", "EXPOSURE")}

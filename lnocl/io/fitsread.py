@@ -10,6 +10,8 @@ import numpy as np
 from astropy.io import fits
 from numpy.typing import NDArray
 
+from lnocl.core.scene.arrays import are_colours
+from lnocl.core.scene.transforms import enlarged
 from lnocl.errors import FileError, InputError, counted, note, warn
 from lnocl.io.encoded import linear
 from lnocl.io.fitsfile import open_fits
@@ -17,8 +19,6 @@ from lnocl.io.headers import finer_cards, make_wcs, quiet_log, readable
 from lnocl.io.names import parse_name
 from lnocl.io.selection import choose, describe, find, has_pixels, name_of, only
 from lnocl.process import ignored_warnings
-from lnocl.scene.arrays import are_colours
-from lnocl.scene.transforms import enlarged
 
 # Beginnings of CTYPE3 of cubes whose planes are not of one sky: colours, energies, velocities,
 # polarisations.

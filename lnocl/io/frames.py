@@ -8,6 +8,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from astropy.io import fits
 
+from lnocl.core.scene import units
+from lnocl.core.scene.arrays import Array, Mask
+from lnocl.core.scene.observation import Observation
+from lnocl.core.scene.psfs import check_psfs
+from lnocl.core.scene.transforms import enlarged
 from lnocl.errors import InputError, note
 from lnocl.io.calibration import Calibration, Word
 from lnocl.io.electrons import Electrons
@@ -19,11 +24,6 @@ from lnocl.io.names import PSF_ERRORS, parse_kind
 from lnocl.io.pixel_scales import warn_of_pixel_scales
 from lnocl.io.places import read_epochs, read_places
 from lnocl.io.psf_grids import is_grid, read_grid
-from lnocl.scene import units
-from lnocl.scene.arrays import Array, Mask
-from lnocl.scene.observation import Observation
-from lnocl.scene.psfs import check_psfs
-from lnocl.scene.transforms import enlarged
 
 # The word for a halo that is the same in all pixels.
 FLAT = "flat"

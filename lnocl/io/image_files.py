@@ -7,13 +7,13 @@ from functools import cached_property
 
 import numpy as np
 
+from lnocl.core.scene.arrays import Array
+from lnocl.core.scene.transforms import enlarged
 from lnocl.errors import InputError
 from lnocl.io.calibration import Calibration
 from lnocl.io.fitsread import keyword_number, read_extension, read_keyword, read_stack
 from lnocl.io.maps import Maps
 from lnocl.io.noise import NoiseMap, read_noise_map
-from lnocl.scene.arrays import Array
-from lnocl.scene.transforms import enlarged
 
 
 class ImageFiles:

@@ -12,9 +12,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from lnocl.core.scene.arrays import Array
+from lnocl.core.scene.noise_check import noise_of
 from lnocl.errors import InputError, note
-from lnocl.scene.arrays import Array
-from lnocl.scene.noise_check import noise_of
 
 Mask = NDArray[np.bool_]
 

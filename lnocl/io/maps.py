@@ -7,13 +7,13 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
+from lnocl.core.scene import units
+from lnocl.core.scene.arrays import Array
+from lnocl.core.scene.transforms import enlarged
 from lnocl.errors import InputError, counted
 from lnocl.io.calibration import Word
 from lnocl.io.fitsread import read_stack
 from lnocl.io.names import file_of
-from lnocl.scene import units
-from lnocl.scene.arrays import Array
-from lnocl.scene.transforms import enlarged
 
 # Units that maps are taken in.
 UNITS = {"background": units.COUNTS, "read_noise": units.COUNTS, "exposure": ("second",)}

@@ -6,12 +6,12 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from lnocl.core.scene.arrays import Array, Mask
 from lnocl.errors import counted, note, warn
 from lnocl.io.calibration import Calibration
 from lnocl.io.fitsread import read_contents
 from lnocl.io.flags import NO_BITS, bad_pixels, good_bits_of, most_common_flag
 from lnocl.io.image_files import ImageFiles
-from lnocl.scene.arrays import Array, Mask
 
 # Of more masked pixels than this share of an image it is warned.
 MUCH_MASKED = 0.1

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from lnocl.core.scene import units
 from lnocl.errors import InputError, note
 from lnocl.io.fitsread import Contents, read_contents
 from lnocl.io.headers import CONVERTERS
 from lnocl.io.names import ERR
-from lnocl.scene import units
 
 # Those whose files are known.
 TELESCOPES = ("HST", "JWST")

@@ -8,12 +8,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from lnocl.core.scene.arrays import Array
+from lnocl.core.scene.uncertainties import OtherNoiseError, variance_of, without_source
 from lnocl.errors import InputError
 from lnocl.io.levels import clipped_sky
 from lnocl.io.maps import Maps
 from lnocl.io.names import ERR, NOISE, parse_kind
-from lnocl.scene.arrays import Array
-from lnocl.scene.uncertainties import OtherNoiseError, variance_of, without_source
 
 # No image has so many times the noise that its sky shows.
 TOO_NOISY = 5.0

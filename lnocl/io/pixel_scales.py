@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
+from lnocl.core.scene.fields import OVERSAMPLES
 from lnocl.errors import warn
 from lnocl.io import sky
 from lnocl.io.fitsread import Stack
-from lnocl.scene.fields import OVERSAMPLES
 
 # The logarithm of the pixels' size in image and PSF may differ by this much.
 MAX_SCALE_ERROR = 0.02

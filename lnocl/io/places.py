@@ -10,14 +10,14 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from astropy.io import fits
 
+from lnocl.core.scene.arrays import Array
+from lnocl.core.scene.quantities import in_unit
+from lnocl.core.scene.transforms import rotations, scale_of
+from lnocl.core.scene.units import parse
 from lnocl.errors import FileError, InputError, counted, note, warn
 from lnocl.io import sky
 from lnocl.io.fitsfile import open_fits, open_regular
 from lnocl.io.fitsread import Stack, keyword_number, read_keyword
-from lnocl.scene.arrays import Array
-from lnocl.scene.quantities import in_unit
-from lnocl.scene.transforms import rotations, scale_of
-from lnocl.scene.units import parse
 
 if TYPE_CHECKING:
     from lnocl.io.calibration import Calibration, Word

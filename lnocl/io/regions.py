@@ -10,15 +10,15 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from lnocl.core.scene.apertures import Aperture, Profile
 from lnocl.errors import FileError, InputError, LnoclError, note
 from lnocl.io.fitsread import sky_header
 from lnocl.io.sky import celestial_wcs
-from lnocl.scene.apertures import Aperture, Profile
 
 if TYPE_CHECKING:
     from astropy.io import fits
 
-    from lnocl.scene.observation import Observation
+    from lnocl.core.scene.observation import Observation
 
 # The share of a region that rounding may leave outside an image.
 ROUNDING = 1e-9

@@ -11,13 +11,13 @@ import numpy as np
 from astropy.io import fits
 from numpy.typing import NDArray
 
+from lnocl.core.scene.detector import on_sky
+from lnocl.core.scene.fields import OVERSAMPLES
 from lnocl.errors import FileError
 from lnocl.io.fitsfile import open_fits
 from lnocl.io.headers import number, readable
 from lnocl.io.parts import no_result, parts_of
 from lnocl.io.selection import has_pixels
-from lnocl.scene.detector import on_sky
-from lnocl.scene.fields import OVERSAMPLES
 
 Columns = dict[str, NDArray[np.float64]]
 

@@ -13,10 +13,10 @@ from astropy.io import fits
 from astropy.wcs import WCS
 from astropy.wcs.utils import pixel_to_pixel
 
+from lnocl.core.scene.arrays import Array
 from lnocl.errors import InputError
 from lnocl.io.headers import make_wcs, quiet_log
 from lnocl.process import ignored_warnings
-from lnocl.scene.arrays import Array
 
 # Largest variation of the offset between two images over them, in pixels, from rotation, scale and
 # distortion.

@@ -16,14 +16,14 @@ from astropy.table import Table
 from astropy.time import Time
 from astropy.utils.xml.iterparser import get_xml_iterator
 
+from lnocl.core.scene import star_tables
+from lnocl.core.scene.arrays import Array
 from lnocl.errors import FileError, InputError, LnoclError, counted, note, warn
 from lnocl.io.fitsfile import open_fits, open_regular
 from lnocl.io.fitsread import read_keyword
 from lnocl.io.packed import unpacked
 from lnocl.io.sky import celestial_wcs, has_celestial, to_pixels
 from lnocl.process import ignored_warnings
-from lnocl.scene import star_tables
-from lnocl.scene.arrays import Array
 
 # Positions by pixels and by the sky may differ by so many pixels, as catalogues round them.
 SAME_PLACE = 1.0

@@ -9,8 +9,8 @@ import numpy as np
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
+from lnocl.core.scene.arrays import Array
 from lnocl.plotting.figure import MOST_STARS, as_text, line_style
-from lnocl.scene.arrays import Array
 
 
 class LightCurves(NamedTuple):

@@ -12,8 +12,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+from lnocl.core.scene.arrays import Array
 from lnocl.plotting.figure import COLOURS, line_style, new_figure, show_image
-from lnocl.scene.arrays import Array
 
 # Share of a PSF's peak at which its stretch ends.
 PSF_FLOOR = 1e-4

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from lnocl.core.scene.arrays import Array
 from lnocl.notebook import block_means
 from lnocl.plotting.figure import COLOUR_MAP, new_figure, png_of
 from lnocl.plotting.result import (
@@ -30,7 +31,6 @@ from lnocl.plotting.result import (
     worst_image,
 )
 from lnocl.plotting.significance import SignificanceView, draw_significance
-from lnocl.scene.arrays import Array
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

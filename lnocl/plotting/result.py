@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+from lnocl.core.scene.arrays import Array
 from lnocl.plotting import light_curves
 from lnocl.plotting.figure import (
     COLOUR_MAP,
@@ -24,7 +25,6 @@ from lnocl.plotting.figure import (
     show_image,
 )
 from lnocl.plotting.light_curves import LightCurves
-from lnocl.scene.arrays import Array
 
 # Residuals are shown between these, in standard deviations of the noise.
 MAX_SIGMA = 5.0

@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+from lnocl.core.scene.arrays import Array
 from lnocl.plotting.figure import (
     COLOURS,
     MOST_NUMBERED,
@@ -22,7 +23,6 @@ from lnocl.plotting.figure import (
     new_figure,
     show_image,
 )
-from lnocl.scene.arrays import Array
 
 # The map of signal-to-noise is shown up to so many thresholds.
 SHOWN = 1.5

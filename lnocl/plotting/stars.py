@@ -10,9 +10,9 @@ import numpy as np
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+from lnocl.core.scene.arrays import Array
 from lnocl.plotting.figure import COLOURS, new_figure, show_image
 from lnocl.plotting.result import image_limits
-from lnocl.scene.arrays import Array
 
 # Stars that are numbered, the brightest; more would hide each other.
 MAX_NUMBERED = 200

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from scipy import optimize
 from scipy.ndimage import maximum_filter, median_filter
 
+from lnocl.core.scene.arrays import Array, Mask
 from lnocl.errors import InputError
-from lnocl.scene.arrays import Array, Mask
 
 # Places in an image, row before column.
 Pixel = tuple[int, int]

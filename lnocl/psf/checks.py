@@ -7,9 +7,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from lnocl.core.scene.arrays import numbers, whole
+from lnocl.core.scene.quantities import in_unit
 from lnocl.errors import InputError
-from lnocl.scene.arrays import numbers, whole
-from lnocl.scene.quantities import in_unit
 
 MIN_SIZE = 3
 

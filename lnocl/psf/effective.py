@@ -10,14 +10,14 @@ from astropy.stats import sigma_clipped_stats
 from scipy.ndimage import binary_dilation, maximum_filter, shift
 from scipy.spatial import KDTree
 
+from lnocl.core.scene.arrays import Array, Mask
+from lnocl.core.scene.shifting import MovablePsf
 from lnocl.detection.fitting import step
 from lnocl.detection.maxima import SIGNIFICANT
 from lnocl.errors import InputError, counted
 from lnocl.psf.centring import Point, brightest
 from lnocl.psf.repair import repair
 from lnocl.psf.steps import cut_square, measure_background, nearest_pixel
-from lnocl.scene.arrays import Array, Mask
-from lnocl.scene.shifting import MovablePsf
 
 # Rounds of fitting the stars and adding what is left of them to the PSF.
 ROUNDS = 20

@@ -12,13 +12,13 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
+from lnocl.core.scene.arrays import Array, Mask, flag
+from lnocl.core.scene.quantities import in_unit, split
+from lnocl.core.scene.shifting import MARGIN
 from lnocl.detection.checks import read_image
 from lnocl.errors import InputError
 from lnocl.psf import checks, effective, resampling, steps
 from lnocl.psf.centring import Pixel, Point
-from lnocl.scene.arrays import Array, Mask, flag
-from lnocl.scene.quantities import in_unit, split
-from lnocl.scene.shifting import MARGIN
 
 
 @dataclass(frozen=True)
@@ -214,10 +214,10 @@ def make_psf(
     Without noise it is 0.002 pixels where the FWHM is 1.5, and 0.012 where it is 1.
 
     **The shift** to the middle of a pixel takes the star for a sum of Gaussians on its pixels
-    (`lnocl.scene.shifting.place`). It is exact where the pixels sample the PSF, two to its FWHM and
-    more. Below that it blurs, by 7 to 10 % of the peak at a FWHM of 1.5. It also rings where the
-    star lies near the edge of a pixel. The table has the negative pixels of a Gaussian in 65 x 65
-    pixels, after the worst of shifts and a quarter of a pixel from the middle.
+    (`lnocl.core.scene.shifting.place`). It is exact where the pixels sample the PSF, two to its
+    FWHM and more. Below that it blurs, by 7 to 10 % of the peak at a FWHM of 1.5. It also rings
+    where the star lies near the edge of a pixel. The table has the negative pixels of a Gaussian in
+    65 x 65 pixels, after the worst of shifts and a quarter of a pixel from the middle.
 
     ==== ======================= ================= =======================
     FWHM darkest pixel, of peak, all of them, of   all of them, of flux,

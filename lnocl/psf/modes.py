@@ -7,9 +7,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
+from lnocl.core.scene.arrays import Array, numbers
+from lnocl.core.scene.quantities import bare
 from lnocl.errors import InputError, counted
-from lnocl.scene.arrays import Array, numbers
-from lnocl.scene.quantities import bare
 
 
 class PsfModes(NamedTuple):

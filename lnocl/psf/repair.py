@@ -10,7 +10,7 @@ import numpy as np
 from scipy.interpolate import RBFInterpolator
 from scipy.ndimage import convolve1d, maximum_filter
 
-from lnocl.scene.arrays import Array, Mask
+from lnocl.core.scene.arrays import Array, Mask
 
 # A bad pixel is repaired if in the square of side `WINDOW` around it are `MIN_GOOD` good ones. So
 # many lie on no two lines and on no conic, where the interpolation would not be unique.

@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.ndimage import median_filter
 
+from lnocl.core.scene.cores import centre, fwhm, off_centre
+from lnocl.core.scene.psfs import FAR_OFF_CENTRE, LITTLE_OFF_CENTRE, MUCH_NEGATIVE
 from lnocl.detection.checks import read_psf
-from lnocl.scene.cores import centre, fwhm, off_centre
-from lnocl.scene.psfs import FAR_OFF_CENTRE, LITTLE_OFF_CENTRE, MUCH_NEGATIVE
 
 # Wings and border are squares round the centre, as shares of half the side.
 WINGS, BORDER = (0.55, 0.7), (0.85, 1.0)

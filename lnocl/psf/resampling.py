@@ -10,15 +10,16 @@ import math
 
 import numpy as np
 
-from lnocl.scene.arrays import Array
-from lnocl.scene.rotation import turned_psf
-from lnocl.scene.shifting import place
+from lnocl.core.scene.arrays import Array
+from lnocl.core.scene.rotation import turned_psf
+from lnocl.core.scene.shifting import place
 
 
 def shift(image: Array, by: tuple[float, float]) -> Array:
     """Return an image of a star moved by (rows, columns), wrapped round.
 
-    It is moved as `lnocl.scene.shifting.place` moves a PSF: as a sum of Gaussians on its pixels.
+    It is moved as `lnocl.core.scene.shifting.place` moves a PSF: as a sum of Gaussians on its
+    pixels.
 
     Parameters
     ----------

@@ -10,6 +10,9 @@ from astropy.stats import mad_std, sigma_clipped_stats
 from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import label, maximum_filter, value_indices
 
+from lnocl.core.scene.apertures import FWHM
+from lnocl.core.scene.arrays import Array, Mask, numbers
+from lnocl.core.scene.shifting import ENDLESS, MARGIN, MovablePsf
 from lnocl.detection.fitting import fit
 from lnocl.detection.maxima import SIGNIFICANT
 from lnocl.errors import InputError, counted, warn
@@ -18,9 +21,6 @@ from lnocl.psf.centring import SEARCH, Pixel, Point, brightest, fit_gaussian
 from lnocl.psf.checks import MIN_SIZE, one_number
 from lnocl.psf.repair import WINDOW, repair
 from lnocl.psf.wings import FROM, distance, fit_sky
-from lnocl.scene.apertures import FWHM
-from lnocl.scene.arrays import Array, Mask, numbers
-from lnocl.scene.shifting import ENDLESS, MARGIN, MovablePsf
 
 # The background is lowered by so many of its errors or more, and by this share of the flux; where
 # the farthest pixels are above it by less than this share of that. Of a larger share it is warned.

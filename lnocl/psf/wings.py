@@ -8,8 +8,8 @@ import numpy as np
 from astropy.stats import mad_std
 from scipy.spatial.distance import cdist
 
+from lnocl.core.scene.arrays import Array, Mask
 from lnocl.psf.centring import Point
-from lnocl.scene.arrays import Array, Mask
 
 # Wings are those of stars from so many widths on. They are measured in so many parts, of pixels as
 # far from the stars, with so many pixels each or more.

@@ -11,6 +11,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from lnocl.core.runs.outcome import Outcome, PsfRefinement
+from lnocl.core.scene.arrays import Array
+from lnocl.core.scene.observation import Observation
 from lnocl.errors import with_names
 from lnocl.notebook import html_card
 from lnocl.plotting.result import draw_result
@@ -18,9 +21,6 @@ from lnocl.residuals import Fit, StarResiduals, judge, residuals
 from lnocl.result.estimate import Callback, Estimate, Iterating
 from lnocl.result.measured import Findings, Measured
 from lnocl.result.views import view_of
-from lnocl.runs.outcome import Outcome, PsfRefinement
-from lnocl.scene.arrays import Array
-from lnocl.scene.observation import Observation
 
 if TYPE_CHECKING:
     from astropy.io import fits
@@ -80,7 +80,7 @@ class Result(Measured):
         and iteration that they compared last. Empty where they did not choose.
     psf_refinement : PsfRefinement or None
         The outcome for PSFs that were to be refined, or whose scatter was given
-        (`lnocl.runs.outcome.PsfRefinement`); None without either.
+        (`lnocl.core.runs.outcome.PsfRefinement`); None without either.
     halo_fluxes : ndarray of float64, shape (n_halos, p)
         The amounts of the observation's `halos` in each image: electrons on its good pixels, not
         per exposure.

@@ -9,7 +9,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from lnocl.scene.arrays import Array
+from lnocl.core.scene.arrays import Array
 
 
 class Iterating(Protocol):

@@ -9,19 +9,19 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from lnocl.core.runs.outcome import Outcome, PsfRefinement
 from lnocl.errors import note
 from lnocl.io import sky
 from lnocl.io.fitsread import wcs_cards
 from lnocl.io.fitswrite import Card, column_unit, write_result
 from lnocl.io.parts import PARTS, Column
 from lnocl.result.kept import to_parts
-from lnocl.runs.outcome import Outcome, PsfRefinement
 
 if TYPE_CHECKING:
     from astropy.io import fits
 
+    from lnocl.core.scene.observation import Observation
     from lnocl.result import Result
-    from lnocl.scene.observation import Observation
 
 
 # The table ESTIMATE has this many bytes at most.

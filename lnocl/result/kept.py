@@ -15,16 +15,16 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from lnocl.core.runs.inputs import digest_of, inputs_of
+from lnocl.core.runs.outcome import CURVE_DTYPE, Outcome, PsfRefinement
+from lnocl.core.runs.start import Setup
+from lnocl.core.scene.estimate import Estimate
+from lnocl.core.scene.fields import FIELDS
+from lnocl.core.scene.observation import Observation
+from lnocl.core.scene.penalty import Penalty
+from lnocl.core.scene.scene import Scene
+from lnocl.core.scene.star_prior import StarPrior
 from lnocl.process import ignored_warnings
-from lnocl.runs.inputs import digest_of, inputs_of
-from lnocl.runs.outcome import CURVE_DTYPE, Outcome, PsfRefinement
-from lnocl.runs.start import Setup
-from lnocl.scene.estimate import Estimate
-from lnocl.scene.fields import FIELDS
-from lnocl.scene.observation import Observation
-from lnocl.scene.penalty import Penalty
-from lnocl.scene.scene import Scene
-from lnocl.scene.star_prior import StarPrior
 
 Parts = dict[str, NDArray[Any]]
 Built = TypeVar("Built")

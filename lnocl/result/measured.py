@@ -7,17 +7,17 @@ from collections.abc import Callable, Iterable, Iterator
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, Protocol
 
+from lnocl.core.runs.outcome import Outcome
+from lnocl.core.scene.arrays import Array
+from lnocl.core.scene.observation import Observation
 from lnocl.errors import InputError
 from lnocl.residuals import StarResiduals
-from lnocl.runs.outcome import Outcome
-from lnocl.scene.arrays import Array
-from lnocl.scene.observation import Observation
 
 if TYPE_CHECKING:
     from astropy.io import fits
 
+    from lnocl.core.runs.bootstrap import Bootstrap
     from lnocl.parallel import Parallel
-    from lnocl.runs.bootstrap import Bootstrap
     from lnocl.significance import Significance
 
 
@@ -67,7 +67,7 @@ class Measured:
         """Standard errors of the star fluxes, electrons, shape (n,).
 
         They follow from the joint Fisher information of all stars, of halos and of the extended
-        source, which are not taken as known (`lnocl.solvers.star_errors`,
+        source, which are not taken as known (`lnocl.core.solvers.star_errors`,
         :doc:`/validation/errors`). Where a halo is like a star they are large. The relative
         error that the PSFs still have (`psf_refinement`) is added in quadrature. They are
         computed when they are first read. They are NaN where the images do not determine the flux,
@@ -99,7 +99,7 @@ class Measured:
         """Standard errors of the amounts of halos, electrons, shape (n_halos, p).
 
         They follow from the joint Fisher information of halos, stars and the extended source
-        (`lnocl.solvers.halos`), and are computed as `star_flux_errors` are. They are NaN
+        (`lnocl.core.solvers.halos`), and are computed as `star_flux_errors` are. They are NaN
         where the images do not determine an amount.
 
         Warns
@@ -162,10 +162,10 @@ class Measured:
         r"""The light of the extended source in the frame and its standard error, electrons.
 
         It is the sum of the extended source and of what the residuals have beside it
-        (`lnocl.solvers.light`), so that it has no bias, and may be negative where there is little
-        but noise. ``extended.sum()`` is too large there, as no pixel is negative. The error is that
-        of counts, of `star_flux_errors`, and of levels of the background that are not known. It is
-        computed when it is first read.
+        (`lnocl.core.solvers.light`), so that it has no bias, and may be negative where there is
+        little but noise. ``extended.sum()`` is too large there, as no pixel is negative. The error
+        is that of counts, of `star_flux_errors`, and of levels of the background that are not
+        known. It is computed when it is first read.
 
         Examples
         --------
@@ -210,9 +210,9 @@ class Measured:
         """Return the errors of stars, regions, profiles and pixels, by replicas of this result.
 
         A replica is a sky that the result may stand for, observed and reconstructed as the images
-        were, by as many iterations (`lnocl.runs.replicas`, :doc:`/validation/errors`). It costs as
-        much as a run of all counts of that length. All n of them use the buffers and programs of
-        one run.
+        were, by as many iterations (`lnocl.core.runs.replicas`, :doc:`/validation/errors`). It
+        costs as much as a run of all counts of that length. All n of them use the buffers and
+        programs of one run.
 
         Parameters
         ----------
@@ -235,8 +235,8 @@ class Measured:
             Replicas of this result that exist already, of the same regions and seed. The rest is
             added. All is bit for bit as if it had been computed at once.
         callback : callable, optional
-            Called with the errors so far, a `lnocl.runs.bootstrap.Bootstrap`, after each replica
-            from the second on.
+            Called with the errors so far, a `lnocl.core.runs.bootstrap.Bootstrap`, after each
+            replica from the second on.
         parallel : bool, int or "current-scheduler", optional
             Where the replicas are computed (`lnocl.parallel.check_parallel`). False: one after the
             other in this process. True or a number: in as many processes as cores, or in that many.
@@ -246,7 +246,7 @@ class Measured:
         Returns
         -------
         Bootstrap
-            The errors, `lnocl.runs.bootstrap.Bootstrap`.
+            The errors, `lnocl.core.runs.bootstrap.Bootstrap`.
 
         Raises
         ------
@@ -278,9 +278,9 @@ class Measured:
         >>> errors.n
         12
         """
+        from lnocl.core.runs.bootstrap import bootstrap, check_number
         from lnocl.io.regions import read_parts
         from lnocl.parallel import check_parallel
-        from lnocl.runs.bootstrap import bootstrap, check_number
 
         check_number(n, seed)
         check_parallel(parallel)
@@ -327,7 +327,7 @@ class Measured:
         >>> len(result.significance().detections)
         0
         """
-        from lnocl.scene.quantities import in_unit
+        from lnocl.core.scene.quantities import in_unit
         from lnocl.significance import significance  # which loads scipy
 
         width = in_unit("width", width, "pix")

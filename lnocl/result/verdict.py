@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from lnocl.core.runs.progress import Progress
+from lnocl.core.scene.arrays import Array
+from lnocl.core.scene.detector import on_sky
+from lnocl.core.scene.stars import MAX_SHIFT
 from lnocl.errors import MisfitWarning, counted, warn
-from lnocl.runs.progress import Progress
-from lnocl.scene.arrays import Array
-from lnocl.scene.detector import on_sky
-from lnocl.scene.stars import MAX_SHIFT
 
 if TYPE_CHECKING:
     from lnocl.result import Result

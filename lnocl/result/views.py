@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from lnocl.core.runs.outcome import mean_over_epochs
 from lnocl.plotting.light_curves import light_curves
 from lnocl.plotting.result import ResultView
-from lnocl.runs.outcome import mean_over_epochs
 
 if TYPE_CHECKING:
     from lnocl.result import Result

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from astropy import units as u
 
+from lnocl.core.scene.arrays import Array, number_in
 from lnocl.errors import InputError
-from lnocl.scene.arrays import Array, number_in
 
 MIN_SIZE = 32
 

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from scipy import fft
 from scipy.optimize import brentq
 
+from lnocl.core.scene.arrays import Array
 from lnocl.errors import InputError
-from lnocl.scene.arrays import Array
 from lnocl.simulation.checks import check_shape, check_share, number, positive
 from lnocl.simulation.telescope import (
     APERTURE_DIAMETER,

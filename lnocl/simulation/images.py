@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import fft
 
+from lnocl.core.scene.arrays import Array
 from lnocl.errors import InputError
-from lnocl.scene.arrays import Array
 from lnocl.simulation.fizeau import fizeau_psf
 from lnocl.simulation.targets import Target
 from lnocl.simulation.telescope import Experiment

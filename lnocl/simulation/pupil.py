@@ -8,8 +8,8 @@ from collections.abc import Sequence
 import numpy as np
 from astropy import units as u
 
+from lnocl.core.scene.arrays import Array
 from lnocl.errors import InputError
-from lnocl.scene.arrays import Array
 from lnocl.simulation.checks import check_shape, number, positive
 from lnocl.simulation.telescope import APERTURE_DIAMETER, BASELINE, OBSCURATION_DIAMETER
 

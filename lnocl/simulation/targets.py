@@ -12,10 +12,10 @@ from astropy import units as u
 from numpy.typing import ArrayLike
 from scipy.special import expit
 
+from lnocl.core.scene.arrays import unmasked
+from lnocl.core.scene.quantities import bare
 from lnocl.errors import InputError
 from lnocl.io import fitsread
-from lnocl.scene.arrays import unmasked
-from lnocl.scene.quantities import bare
 from lnocl.simulation.checks import check_shape, number
 
 # Below this the 24 rows around the star of `hh34` do not fit.

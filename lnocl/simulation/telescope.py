@@ -8,8 +8,8 @@ import numpy as np
 from astropy import constants
 from astropy import units as u
 
+from lnocl.core.scene.arrays import whole
 from lnocl.errors import InputError
-from lnocl.scene.arrays import whole
 from lnocl.simulation.checks import check_share, number, numbers, positive
 
 MAG_PER_ARCSEC2 = u.mag / u.arcsec**2

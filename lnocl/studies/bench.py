@@ -9,13 +9,13 @@ from collections.abc import Collection, Iterator, Sequence
 from typing import Any, NamedTuple
 
 from lnocl import metrics
+from lnocl.core.opencl.device import choose, describe
+from lnocl.core.runs.options import PAPER
+from lnocl.core.scene.arrays import Array, whole
+from lnocl.core.scene.observation import Observation
 from lnocl.deconvolution import deconvolve
 from lnocl.errors import InputError, LnoclWarning, MisfitWarning
-from lnocl.opencl.device import choose, describe
 from lnocl.result import Estimate, Result
-from lnocl.runs.options import PAPER
-from lnocl.scene.arrays import Array, whole
-from lnocl.scene.observation import Observation
 from lnocl.simulation import hh34, simulate
 
 # Estimates are measured after an eighth, a quarter, half and all of the iterations.

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from lnocl.core.runs.outcome import mean_over_epochs
 from lnocl.errors import InputError
 from lnocl.io import atomic
 from lnocl.io.headers import number
@@ -20,7 +21,6 @@ from lnocl.plotting.profiles import draw_bands
 from lnocl.plotting.report import make_report
 from lnocl.plotting.result import ResultView, draw_result
 from lnocl.plotting.significance import SignificanceView
-from lnocl.runs.outcome import mean_over_epochs
 
 if TYPE_CHECKING:
     from astropy.table import Table

@@ -10,15 +10,15 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from lnocl.core.opencl.device import choose, has_double, spec_of
+from lnocl.core.runs.run import Run
+from lnocl.core.runs.start import Setup, make_start
+from lnocl.core.scene.arrays import Array
+from lnocl.core.scene.observation import Observation
+from lnocl.core.scene.penalty import Penalty
+from lnocl.core.scene.transforms import rotations
+from lnocl.core.solvers import SolverName
 from lnocl.errors import DeviceError, LnoclError
-from lnocl.opencl.device import choose, has_double, spec_of
-from lnocl.runs.run import Run
-from lnocl.runs.start import Setup, make_start
-from lnocl.scene.arrays import Array
-from lnocl.scene.observation import Observation
-from lnocl.scene.penalty import Penalty
-from lnocl.scene.transforms import rotations
-from lnocl.solvers import SolverName
 
 # Iterations by solver; and the deviation allowed by precision. In single precision OpenCL allows
 # divisions and roots that are inexact: with the worst of them the deviation is 2.2e-6, and twice as
@@ -124,7 +124,7 @@ def run(device: str | None = None) -> Iterator[Row]:
     Parameters
     ----------
     device : str, optional
-        As for `lnocl.opencl.device.choose`.
+        As for `lnocl.core.opencl.device.choose`.
     """
     chosen = choose(device).device
     precisions = ["single", *(["double"] if has_double(chosen) else [])]

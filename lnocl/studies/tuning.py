@@ -8,12 +8,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from lnocl.engines.opencl import OpenCLEngine
+from lnocl.core.engines.opencl import OpenCLEngine
+from lnocl.core.opencl.device import choose, has_double
+from lnocl.core.opencl.tuning import Tuning, candidates
+from lnocl.core.scene.observation import Observation
+from lnocl.core.scene.scene import Scene
 from lnocl.errors import DeviceError
-from lnocl.opencl.device import choose, has_double
-from lnocl.opencl.tuning import Tuning, candidates
-from lnocl.scene.observation import Observation
-from lnocl.scene.scene import Scene
 
 SIZE, N_IMAGES, TURNS, SECONDS_A_TURN = 1024, 4, 7, 0.1
 MOST_A_TURN = 1000

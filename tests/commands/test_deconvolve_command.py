@@ -15,7 +15,7 @@ from scenes import paper
 
 import lnocl
 from lnocl.commands import cli
-from lnocl.opencl import device
+from lnocl.core.opencl import device
 
 pytestmark = pytest.mark.usefixtures("command_folder")
 
@@ -153,7 +153,7 @@ class TestDeconvolve:
     def test_a_run_that_ends_at_once_is_said(self, n_iter, capsys, monkeypatch):
         """But not where one iteration was asked for."""
         if n_iter > 1:
-            monkeypatch.setattr("lnocl.solvers.sgp.SUFFICIENT", 1e9)  # no step is enough
+            monkeypatch.setattr("lnocl.core.solvers.sgp.SUFFICIENT", 1e9)  # no step is enough
         run("--solver", "sgp", "--n-iter", str(n_iter))
         said = "it ended after 0 iterations: there is little but noise" in capsys.readouterr().out
         assert said == (n_iter > 1)

@@ -5,8 +5,8 @@ import os
 import pytest
 
 from lnocl.commands import cli
+from lnocl.core.opencl import trial
 from lnocl.errors import DeviceError
-from lnocl.opencl import trial
 
 
 @pytest.mark.parametrize("command", ["demo", "selftest", "devices"])

@@ -251,7 +251,7 @@ class TestDeclared:
         ----------
         n : int, optional
             Largest number of
-            rounds, 1 or more (see `lnocl.scene.penalty.Penalty`).
+            rounds, 1 or more (see `lnocl.core.scene.penalty.Penalty`).
 
             What the reference says besides.
         size : int or "auto", optional

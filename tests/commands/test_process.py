@@ -17,9 +17,9 @@ from commandline import GIVEN, NUMPY, PAPER, SHAPE, outside, run
 
 import lnocl
 from lnocl.commands import cli
-from lnocl.opencl import device
-from lnocl.opencl.tuning import candidates, chosen, describe_tuning
-from lnocl.runs.progress import Progress
+from lnocl.core.opencl import device
+from lnocl.core.opencl.tuning import candidates, chosen, describe_tuning
+from lnocl.core.runs.progress import Progress
 from lnocl.studies import tuning
 
 pytestmark = pytest.mark.usefixtures("command_folder")

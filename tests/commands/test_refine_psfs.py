@@ -11,9 +11,9 @@ from astropy.io import fits
 
 import lnocl
 from lnocl.commands import cli
+from lnocl.core.scene.psf_families import PsfFamilies
 from lnocl.io.saved_results import read_result
 from lnocl.plotting.beside import draw_beside
-from lnocl.scene.psf_families import PsfFamilies
 from lnocl.studies.figures import view_of
 
 N, STAR = 32, (15, 12)

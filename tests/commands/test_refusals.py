@@ -10,8 +10,8 @@ from commandline import NUMPY, one_complaint, outside, run
 
 import lnocl
 from lnocl.commands import cli
+from lnocl.core.opencl import device
 from lnocl.errors import DeviceError
-from lnocl.opencl import device
 
 pytestmark = pytest.mark.usefixtures("command_folder")
 

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from lnocl.core.scene.shifting import ENDLESS, MovablePsf
 from lnocl.detection.fitting import amounts, fit
-from lnocl.scene.shifting import ENDLESS, MovablePsf
 
 SHAPE = (25, 27)
 

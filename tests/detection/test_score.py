@@ -10,14 +10,14 @@ from scenes import blur
 from scipy import ndimage
 
 import lnocl
+from lnocl.core.scene.estimate import Estimate
+from lnocl.core.scene.scene import Scene
 from lnocl.detection.completeness import needed
 from lnocl.detection.false_alarms import Rarity, of_student, threshold
 from lnocl.detection.maxima import peaks
 from lnocl.detection.score import Null
 from lnocl.detection.score_map import ScoreMap
 from lnocl.detection.score_noise import noise_of
-from lnocl.scene.estimate import Estimate
-from lnocl.scene.scene import Scene
 
 NO_ERRORS = np.zeros(1), np.zeros(0)
 ROWS, COLUMNS = np.indices((9, 9)) - 4

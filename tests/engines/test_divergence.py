@@ -6,10 +6,10 @@ import numpy as np
 import pyopencl as cl
 import pytest
 
-from lnocl.opencl.device import choose
-from lnocl.opencl.launch import READ_WRITE
-from lnocl.opencl.program import Program
-from lnocl.opencl.sources import source
+from lnocl.core.opencl.device import choose
+from lnocl.core.opencl.launch import READ_WRITE
+from lnocl.core.opencl.program import Program
+from lnocl.core.opencl.sources import source
 
 pytestmark = pytest.mark.filterwarnings("ignore::pyopencl.CompilerWarning")
 

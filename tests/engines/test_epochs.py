@@ -10,10 +10,10 @@ from scenes import FEWER_ENGINES, paper, same, worst
 from turned_scenes import FLUXES, GRID, NX, NY, STARS, gaussian, observation
 
 import lnocl
+from lnocl.core.scene.estimate import Estimate
+from lnocl.core.scene.scene import Scene
+from lnocl.core.solvers.near_star import NearStar, Surroundings
 from lnocl.io.saved_results import read_result
-from lnocl.scene.estimate import Estimate
-from lnocl.scene.scene import Scene
-from lnocl.solvers.near_star import NearStar, Surroundings
 
 EPOCHS = ["b", "a", "b"]  # of images 0 and 2, and of image 1, which comes first
 START = {

@@ -10,7 +10,7 @@ import pytest
 from scenes import FEWER_ENGINES, paper, same, worst
 
 import lnocl
-from lnocl.engines.opencl import ROUNDING
+from lnocl.core.engines.opencl import ROUNDING
 
 SHAPE = NY, NX = 16, 32
 FLUXES = np.array([1500.0, 900.0])

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import lnocl
-from lnocl.runs.outcome import Outcome
+from lnocl.core.runs.outcome import Outcome
 
 N = 64
 Y, X = np.indices((N, N), float)

@@ -11,7 +11,7 @@ from halo_scenes import AMOUNTS, FLUX, LEVELS, STAR, N, P, observation
 from scenes import NUMPY_FIRST, Recipe, paper, same, worst
 
 import lnocl
-from lnocl.scene.scene import Scene
+from lnocl.core.scene.scene import Scene
 
 SOLVERS = "sgm", "sgp"
 pytestmark = pytest.mark.filterwarnings(

@@ -15,9 +15,9 @@ import scipy.fft
 from scenes import ENGINES, Recipe, paper, placed, worst
 from scipy.special import kl_div
 
-from lnocl.opencl import program
-from lnocl.scene.penalty import Penalty
-from lnocl.scene.scene import Scene
+from lnocl.core.opencl import program
+from lnocl.core.scene.penalty import Penalty
+from lnocl.core.scene.scene import Scene
 
 # PSFs here are small, and whole offsets periodic.
 pytestmark = pytest.mark.filterwarnings(

@@ -10,8 +10,8 @@ from scenes import FEWER_ENGINES, make_smooth_psfs, paper, worst
 from turned_scenes import FLUXES, GRID, NX, NY, STARS, observation
 
 import lnocl
-from lnocl.scene.forward_model import Model
-from lnocl.scene.scene import Scene
+from lnocl.core.scene.forward_model import Model
+from lnocl.core.scene.scene import Scene
 
 pytestmark = pytest.mark.filterwarnings(
     "ignore:psf . is sharper than its pixels", "ignore:the star at .* lies on bad pixels"

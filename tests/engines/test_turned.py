@@ -14,17 +14,17 @@ from scipy.ndimage import gaussian_filter
 from turned_scenes import ANGLES, FLUXES, GRID, NX, NY, STARS, observation, psfs
 
 import lnocl
-from lnocl.engines.opencl import OpenCLEngine
-from lnocl.opencl.tuning import Tuning
-from lnocl.scene.estimate import Estimate
-from lnocl.scene.forward_model import Model, model_images
-from lnocl.scene.padding import recommend_pad
-from lnocl.scene.scene import Scene
-from lnocl.scene.stars import MAX_SHIFT
-from lnocl.scene.view import View, Window
-from lnocl.solvers.marginal import marginal
-from lnocl.solvers.near_star import NearStar, Surroundings
-from lnocl.solvers.positions import StarFit, Stars
+from lnocl.core.engines.opencl import OpenCLEngine
+from lnocl.core.opencl.tuning import Tuning
+from lnocl.core.scene.estimate import Estimate
+from lnocl.core.scene.forward_model import Model, model_images
+from lnocl.core.scene.padding import recommend_pad
+from lnocl.core.scene.scene import Scene
+from lnocl.core.scene.stars import MAX_SHIFT
+from lnocl.core.scene.view import View, Window
+from lnocl.core.solvers.marginal import marginal
+from lnocl.core.solvers.near_star import NearStar, Surroundings
+from lnocl.core.solvers.positions import StarFit, Stars
 
 START = {"initial_extended": np.full((NY, NX), 8.0), "initial_star_fluxes": FLUXES / 2}
 
@@ -250,7 +250,7 @@ def test_images_of_any_order():
 
 def test_turns_beyond_45_degrees():
     """An image turned by 100 degrees more, about its own middle, and its map turned with it."""
-    turn = lnocl.scene.transforms.rotation(np.radians(100.0))
+    turn = lnocl.core.scene.transforms.rotation(np.radians(100.0))
     maps = scenes_turned.transforms()
     middle = scenes_turned.CENTRE
     maps[:, :, 2] = (maps[:, :, 2] - middle) @ turn.T + middle

@@ -8,8 +8,8 @@ from frame_files import IMAGES, notes, observe, read, save, save_images
 from hypothesis import given
 from hypothesis import strategies as st
 
+from lnocl.core.scene import units
 from lnocl.errors import InputError, LnoclWarning
-from lnocl.scene import units
 
 pytestmark = pytest.mark.usefixtures("frame_folder")
 

@@ -14,12 +14,12 @@ from hypothesis import strategies as st
 from wcs_headers import NORTH_UP
 
 import lnocl
+from lnocl.core.scene.noise_check import warn_of_noise
 from lnocl.errors import FileError, InputError, LnoclWarning, counted
 from lnocl.io import sky
 from lnocl.io.fitsread import Stack
 from lnocl.io.levels import sky_level, sky_noise
 from lnocl.io.pixel_scales import warn_of_pixel_scales
-from lnocl.scene.noise_check import warn_of_noise
 
 pytestmark = pytest.mark.usefixtures("frame_folder")
 

@@ -8,7 +8,7 @@ import pytest
 from kernel_cases import FOLDER, harness_of, kernels_in
 from kernel_comparison import KERNELS
 
-from lnocl import reference
+from lnocl.core import reference
 from lnocl.errors import DeviceError
 
 FILES = sorted(path.stem for path in FOLDER.glob("*.cl") if kernels_in(path.name))

@@ -5,9 +5,9 @@ import pytest
 from kernel_cases import agree_with_twins, harness_of, in_each_precision
 from kernel_harness import rounded
 
-from lnocl import reference
-from lnocl.opencl.windows import stars_near
-from lnocl.scene.scene import MIN_MODEL
+from lnocl.core import reference
+from lnocl.core.opencl.windows import stars_near
+from lnocl.core.scene.scene import MIN_MODEL
 
 test_kernels_agree_with_their_twins = agree_with_twins("ratio.cl")
 

@@ -13,11 +13,11 @@ from scipy.special import kl_div
 
 import lnocl
 from lnocl import process
-from lnocl.engines import opencl
-from lnocl.opencl import device, program, sharing
-from lnocl.opencl.tuning import Tuning
-from lnocl.scene.penalty import Penalty
-from lnocl.scene.scene import MIN_MODEL
+from lnocl.core.engines import opencl
+from lnocl.core.opencl import device, program, sharing
+from lnocl.core.opencl.tuning import Tuning
+from lnocl.core.scene.penalty import Penalty
+from lnocl.core.scene.scene import MIN_MODEL
 
 GPU = SimpleNamespace(name="Fast GPU", type=cl.device_type.GPU)
 CPU = SimpleNamespace(name="Slow CPU", type=cl.device_type.CPU)
@@ -136,7 +136,7 @@ def test_workers_take_the_gpus_of_a_platform_in_turn(machine, monkeypatch):
 
 CLAIM = """
 import sys
-from lnocl.opencl import sharing
+from lnocl.core.opencl import sharing
 print(sharing.claim(2), sharing.claim(2), flush=True)
 sys.stdin.read()
 """

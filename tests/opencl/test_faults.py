@@ -14,9 +14,9 @@ from scenes import paper
 
 import lnocl
 from lnocl import checkpoint
-from lnocl.engines import opencl
-from lnocl.engines.numpy import ReferenceEngine
-from lnocl.opencl import device, program
+from lnocl.core.engines import opencl
+from lnocl.core.engines.numpy import ReferenceEngine
+from lnocl.core.opencl import device, program
 
 # Of images of this shape, with a star and mu, kernel_cases.py has the program.
 WITH_STAR = {"stars": [(5, 6)], "mu": 1e-6}

@@ -14,7 +14,7 @@ from processes import run_python
 from runtimes import on_pocl
 
 import lnocl
-from lnocl.opencl import device, kernel_cache
+from lnocl.core.opencl import device, kernel_cache
 
 SAID = "print(deconvolve())"
 
@@ -34,7 +34,8 @@ def test_programs_are_stored_and_used_again(warm, tmp_path):
     name, content, said = warm
     (tmp_path / name).write_bytes(content)
     code = (
-        "from lnocl.opencl import program\nprint(deconvolve())\nprint(os.environ['POCL_CACHE_DIR'])"
+        "from lnocl.core.opencl import program\n"
+        "print(deconvolve())\nprint(os.environ['POCL_CACHE_DIR'])"
     )
     done = run_python(code, POCL_CACHE_DIR=str(tmp_path))
     assert done.stdout == f"{said}{tmp_path}\n"

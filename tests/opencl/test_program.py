@@ -6,10 +6,10 @@ import numpy as np
 import pyopencl as cl
 import pytest
 
-from lnocl.opencl import program
-from lnocl.opencl.device import choose, context_of
-from lnocl.opencl.program import Program
-from lnocl.opencl.tuning import Tuning
+from lnocl.core.opencl import program
+from lnocl.core.opencl.device import choose, context_of
+from lnocl.core.opencl.program import Program
+from lnocl.core.opencl.tuning import Tuning
 
 
 @pytest.fixture

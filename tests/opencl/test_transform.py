@@ -7,7 +7,7 @@ import pyopencl as cl
 import pytest
 from transform import Transform
 
-from lnocl.opencl.device import choose
+from lnocl.core.opencl.device import choose
 
 POWERS = [(n, n) for n in (2, 4, 8, 16, 32, 64, 128, 256, 512, 1024, 2048)]
 # Each odd factor with one, two and three passes within.

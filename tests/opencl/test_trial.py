@@ -11,7 +11,7 @@ from processes import run_python
 from runtimes import on_pocl
 
 import lnocl
-from lnocl.opencl import device, kernel_cache, trial
+from lnocl.core.opencl import device, kernel_cache, trial
 
 pytestmark = [on_pocl, pytest.mark.system]
 

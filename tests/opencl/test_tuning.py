@@ -8,8 +8,8 @@ import pyopencl as cl
 import pytest
 
 import lnocl
-from lnocl.opencl import tuning as module
-from lnocl.opencl.tuning import candidates, in_words, measured, store, tune
+from lnocl.core.opencl import tuning as module
+from lnocl.core.opencl.tuning import candidates, in_words, measured, store, tune
 
 KIB = 1024
 SINGLE, DOUBLE = np.dtype(np.float32), np.dtype(np.float64)

@@ -4,13 +4,13 @@ import pytest
 from processes import run_python
 from runtimes import on_pocl
 
-from lnocl.opencl import unknown_cpu
+from lnocl.core.opencl import unknown_cpu
 
 # PoCL is told that it knows no such CPU, whichever this machine has.
 FORGET = """
 import ctypes, os, struct
 import pyopencl as cl
-from lnocl.opencl import device, unknown_cpu
+from lnocl.core.opencl import device, unknown_cpu
 chosen = device.choose().device
 memory = os.open("/proc/self/mem", os.O_RDWR)
 place = unknown_cpu.find_name(memory, chosen.int_ptr)

@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 from scenes import FEWER_ENGINES, blur, make_psfs, paper, worst
 
 import lnocl
-from lnocl.opencl import program
-from lnocl.scene.penalty import MAX_WEIGHT
+from lnocl.core.opencl import program
+from lnocl.core.scene.penalty import MAX_WEIGHT
 
 SHAPE = (16, 32)
 PSFS = make_psfs(2, (7, 8))

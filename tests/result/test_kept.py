@@ -7,10 +7,10 @@ from scenes import make_smooth_psfs
 from scipy.ndimage import gaussian_filter
 
 import lnocl
+from lnocl.core.runs.replicas import Replicas
 from lnocl.io.fitswrite import write_result
 from lnocl.io.parts import Column, read_parts
 from lnocl.result.kept import from_parts, to_parts
-from lnocl.runs.replicas import Replicas
 from lnocl.significance import significance
 
 NY, NX, LEVEL = 40, 36, 12.0

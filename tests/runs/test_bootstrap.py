@@ -10,16 +10,16 @@ from scipy.ndimage import gaussian_filter
 from scipy.stats import t
 
 import lnocl
-from lnocl.runs import bootstrap, quantities
-from lnocl.runs.bootstrap import Bootstrap, Quantity
-from lnocl.runs.repeated import Repeated
-from lnocl.runs.replicas import Replicas
-from lnocl.runs.run import Run
-from lnocl.runs.start import Setup, make_start
-from lnocl.scene.apertures import Aperture
-from lnocl.scene.penalty import Penalty
-from lnocl.scene.shifting import place
-from lnocl.scene.star_prior import StarPrior
+from lnocl.core.runs import bootstrap, quantities
+from lnocl.core.runs.bootstrap import Bootstrap, Quantity
+from lnocl.core.runs.repeated import Repeated
+from lnocl.core.runs.replicas import Replicas
+from lnocl.core.runs.run import Run
+from lnocl.core.runs.start import Setup, make_start
+from lnocl.core.scene.apertures import Aperture
+from lnocl.core.scene.penalty import Penalty
+from lnocl.core.scene.shifting import place
+from lnocl.core.scene.star_prior import StarPrior
 
 BASE = Recipe((32, 32), 2, 1, smooth=True)
 RECIPES = {

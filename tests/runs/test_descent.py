@@ -8,9 +8,9 @@ from scenes import paper, same
 
 import lnocl
 from lnocl import checkpoint
+from lnocl.core.runs.descent import MAX_RISE, N_ABOVE, Descent, explain_rise
+from lnocl.core.scene.scene import Scene
 from lnocl.errors import DivergedError, NotFiniteError
-from lnocl.runs.descent import MAX_RISE, N_ABOVE, Descent, explain_rise
-from lnocl.scene.scene import Scene
 
 SIZE = 32
 FWHM = 5.9
@@ -66,7 +66,7 @@ def test_the_result_is_the_estimate_of_the_least_objective(engine, seed):
 
 def test_without_it_all_the_light_is_in_one_pixel(monkeypatch):
     """The trap is there."""
-    monkeypatch.setattr("lnocl.runs.descent.N_ABOVE", 10**9)
+    monkeypatch.setattr("lnocl.core.runs.descent.N_ABOVE", 10**9)
     result = paper(observe(4), engine="numpy")
     assert result.stop_reason == "n_iter"
     assert result.extended.max() > 0.9 * result.extended.sum()
@@ -107,7 +107,7 @@ def test_it_is_noticed_at_the_end_of_a_short_run(engine):
 
 
 def test_halves_of_held_out_counts_end_there(monkeypatch):
-    monkeypatch.setattr("lnocl.runs.held_out.MIN_ITERATIONS", 50)
+    monkeypatch.setattr("lnocl.core.runs.held_out.MIN_ITERATIONS", 50)
     with pytest.warns(lnocl.LnoclWarning, match="held-out counts choose among") as caught:
         result = paper(observe(1), engine="numpy", stop="held-out", n_iter=100)
     end = int(str(caught[0].message).rsplit(" ", 1)[1])
@@ -116,8 +116,8 @@ def test_halves_of_held_out_counts_end_there(monkeypatch):
 
 
 def test_halves_that_rise_from_the_start_are_refused(monkeypatch):
-    monkeypatch.setattr("lnocl.runs.held_out.MIN_ITERATIONS", 50)
-    monkeypatch.setattr("lnocl.runs.run.Run.best_iteration", lambda run: 0)
+    monkeypatch.setattr("lnocl.core.runs.held_out.MIN_ITERATIONS", 50)
+    monkeypatch.setattr("lnocl.core.runs.run.Run.best_iteration", lambda run: 0)
     with pytest.raises(DivergedError, match=r"the objective rises: .*; mend the psfs, or take"):
         paper(observe(1), engine="numpy", stop="held-out", n_iter=100)
 

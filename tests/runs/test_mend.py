@@ -7,10 +7,10 @@ import pytest
 from regions import CirclePixelRegion, PixCoord
 
 import lnocl
+from lnocl.core.runs.psf_refinement import _is_trusted, _State
+from lnocl.core.scene.psf_families import PsfFamilies
+from lnocl.core.scene.psf_misfit import PsfMisfit
 from lnocl.errors import LnoclWarning
-from lnocl.runs.psf_refinement import _is_trusted, _State
-from lnocl.scene.psf_families import PsfFamilies
-from lnocl.scene.psf_misfit import PsfMisfit
 
 pytestmark = pytest.mark.filterwarnings("ignore::lnocl.LnoclWarning")
 
@@ -202,7 +202,7 @@ class TestSpeckles:
 
 
 def test_psfs_of_many_stars_are_judged_only_where_that_is_asked(monkeypatch, caplog):
-    monkeypatch.setattr("lnocl.runs.psf_refinement.MOST_STARS", 0)
+    monkeypatch.setattr("lnocl.core.runs.psf_refinement.MOST_STARS", 0)
     caplog.set_level("INFO", "lnocl")
     assert solve(blurred(0.5, 0.0, 0.5), stop=None, n_iter=5).psf_refinement is None
     assert "PSFs are not judged: 1 star in the window" in caplog.text

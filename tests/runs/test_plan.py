@@ -9,12 +9,12 @@ from astropy.io import fits
 
 import lnocl
 from lnocl import reconstruction
+from lnocl.core.runs import halos, psf_refinement
+from lnocl.core.runs.outcome import Mended
+from lnocl.core.runs.plan import CHOICE, HALOS, LEVELS, PRIOR, PSFS, STARS, STEPS
+from lnocl.core.runs.preparation import prepare
+from lnocl.core.scene.penalty import recommend_smoothing
 from lnocl.errors import InputError
-from lnocl.runs import halos, psf_refinement
-from lnocl.runs.outcome import Mended
-from lnocl.runs.plan import CHOICE, HALOS, LEVELS, PRIOR, PSFS, STARS, STEPS
-from lnocl.runs.preparation import prepare
-from lnocl.scene.penalty import recommend_smoothing
 
 Y, X = np.indices((24, 24))
 PSF = np.exp(-((X[:17, :17] - 8.0) ** 2 + 1.3 * (Y[:17, :17] - 8.0) ** 2) / 3.0)

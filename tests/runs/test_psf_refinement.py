@@ -8,13 +8,13 @@ import pytest
 from scenes import PAPER
 
 import lnocl
+from lnocl.core.runs import guarded_runs, psf_refinement
+from lnocl.core.runs.psf_allowance import STRENGTH
+from lnocl.core.runs.start import Setup
+from lnocl.core.scene.padding import choose_pad
+from lnocl.core.scene.psf_families import PsfFamilies
+from lnocl.core.scene.pupils import Pupil
 from lnocl.metrics import restoration_error, star_rows
-from lnocl.runs import guarded_runs, psf_refinement
-from lnocl.runs.psf_allowance import STRENGTH
-from lnocl.runs.start import Setup
-from lnocl.scene.padding import choose_pad
-from lnocl.scene.psf_families import PsfFamilies
-from lnocl.scene.pupils import Pupil
 from lnocl.simulation import Experiment, fizeau_psf, hh34
 
 pytestmark = pytest.mark.filterwarnings("ignore::lnocl.LnoclWarning")
@@ -198,7 +198,7 @@ def test_the_order_of_the_images_does_not_matter():
 
 
 def test_images_larger_than_the_window_are_looked_at_round_the_stars(monkeypatch):
-    monkeypatch.setattr("lnocl.runs.guarded_runs.WINDOW", 48)
+    monkeypatch.setattr("lnocl.core.runs.guarded_runs.WINDOW", 48)
     images = images_through([changed(("jitter",), (0.6, 0.0, 0.3))])
     result = refine(images, PSF, ("jitter",))
     assert result.psf_refinement.is_accepted
@@ -206,7 +206,7 @@ def test_images_larger_than_the_window_are_looked_at_round_the_stars(monkeypatch
 
 
 def test_stars_far_apart_are_looked_at_where_most_are(monkeypatch):
-    monkeypatch.setattr("lnocl.runs.guarded_runs.WINDOW", 32)
+    monkeypatch.setattr("lnocl.core.runs.guarded_runs.WINDOW", 32)
     observation = lnocl.Observation(np.ones((1, 100, 120)), np.ones((40, 5)))
     stars = np.array([(5.0, 90.0), (100.0, 20.0), (108.4, 24.0)])
     setup = Setup(observation, stars, 0, "sgp", "single", "numpy", None)
@@ -228,7 +228,7 @@ def test_stars_far_apart_are_looked_at_where_most_are(monkeypatch):
 
 
 def test_psfs_of_a_window_vary_as_those_of_the_images(monkeypatch):
-    monkeypatch.setattr("lnocl.runs.guarded_runs.WINDOW", 32)
+    monkeypatch.setattr("lnocl.core.runs.guarded_runs.WINDOW", 32)
     widths = 3.0 + np.arange(4) / 2.0
     psfs = [psf[20:45, 20:45] / psf[20:45, 20:45].sum() for psf in map(moffat, widths)]
     field = lnocl.PsfField(psfs, [(0, 0), (119, 0), (0, 99), (119, 99)])

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 import lnocl
-from lnocl.runs.run import Run
-from lnocl.runs.start import Setup, make_start
-from lnocl.scene.penalty import Penalty
+from lnocl.core.runs.run import Run
+from lnocl.core.runs.start import Setup, make_start
+from lnocl.core.scene.penalty import Penalty
 
 GOOD = (12, 9)
 Y, X = np.mgrid[-3:4, -3:4]

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import lnocl
-from lnocl.scene.penalty import recommend_smoothing
+from lnocl.core.scene.penalty import recommend_smoothing
 
 
 def moffat(x, y, fwhm, beta):

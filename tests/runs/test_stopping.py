@@ -13,14 +13,14 @@ from hypothesis import strategies as st
 from scenes import paper
 
 import lnocl
+from lnocl.core.runs.assessment import assess
+from lnocl.core.runs.halves import Snapshot
+from lnocl.core.runs.progress import Progress
+from lnocl.core.runs.stopping import CHANGE_WINDOW, expected_deviance
+from lnocl.core.runs.thinning import split_counts
+from lnocl.core.scene.penalty import SMOOTHING, Penalty, recommend_smoothing
+from lnocl.core.scene.scene import Scene
 from lnocl.errors import LnoclWarning
-from lnocl.runs.assessment import assess
-from lnocl.runs.halves import Snapshot
-from lnocl.runs.progress import Progress
-from lnocl.runs.stopping import CHANGE_WINDOW, expected_deviance
-from lnocl.runs.thinning import split_counts
-from lnocl.scene.penalty import SMOOTHING, Penalty, recommend_smoothing
-from lnocl.scene.scene import Scene
 
 SIZE, STAR = 64, (40, 24)
 
@@ -305,7 +305,7 @@ class TestHeldOut:
         assert run(scene()[0], n_iter=2).held_out.size == 0
 
     def test_halves_that_end_at_once_are_refused(self, monkeypatch):
-        monkeypatch.setattr("lnocl.runs.run.SOLVERS", {"sgp": lambda *_: iter(())})
+        monkeypatch.setattr("lnocl.core.runs.run.SOLVERS", {"sgp": lambda *_: iter(())})
         with pytest.raises(lnocl.InputError, match="no iteration betters the start"):
             run(scene()[0], stop="held-out")
 
@@ -334,7 +334,7 @@ class Screen(io.StringIO):
 def test_progress_ends_at_the_last_iteration(stop, words, interval, monkeypatch):
     screen = Screen()
     monkeypatch.setattr("sys.stderr", screen)
-    monkeypatch.setattr("lnocl.runs.progress.PROGRESS_INTERVAL", interval)
+    monkeypatch.setattr("lnocl.core.runs.progress.PROGRESS_INTERVAL", interval)
     result = run(scene()[0], n_iter=60, stop=stop, progress=True)
     last = [each for each in screen.getvalue().split("\r") if "iterations" in each][-1]
     assert f"{result.n_iter}/60" in last
@@ -345,7 +345,7 @@ def test_progress_ends_at_the_last_iteration(stop, words, interval, monkeypatch)
 def test_progress_of_held_out_counts_has_no_end(monkeypatch):
     screen = Screen()
     monkeypatch.setattr("sys.stderr", screen)
-    monkeypatch.setattr("lnocl.runs.progress.PROGRESS_INTERVAL", 0.0)
+    monkeypatch.setattr("lnocl.core.runs.progress.PROGRESS_INTERVAL", 0.0)
     run(scene()[0], n_iter=60, stop="held-out", progress=True)
     last = [each for each in screen.getvalue().split("\r") if "iterations" in each][-1]
     assert "it [" in last
@@ -397,7 +397,7 @@ class TestSmoothing:
             judged.append((snapshots, reference, found))
             return found
 
-        monkeypatch.setattr("lnocl.runs.held_out.assess", note)
+        monkeypatch.setattr("lnocl.core.runs.held_out.assess", note)
         result = run(scene()[0], stop="held-out", smoothing="auto")
         n_weights = len(np.unique(result.held_out["smoothing"]))
         *_, first = judged[: -n_weights + 1]
@@ -462,7 +462,7 @@ def test_each_phase_is_shown(monkeypatch):
 
 
 def test_without_a_terminal_the_log_has_lines_while_a_step_is_long(monkeypatch, caplog):
-    monkeypatch.setattr("lnocl.runs.progress.LINE_INTERVAL", 0.01)
+    monkeypatch.setattr("lnocl.core.runs.progress.LINE_INTERVAL", 0.01)
     caplog.set_level("INFO", "lnocl.progress")
     with Progress(3, "tile", True, "deconvolving") as progress:
         progress.update()

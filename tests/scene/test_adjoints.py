@@ -13,16 +13,16 @@ import turned_scenes
 from scenes import make_psfs, make_smooth_psfs
 
 import lnocl
-from lnocl.scene.camera import Camera, sampled
-from lnocl.scene.estimate import Estimate
-from lnocl.scene.forward_model import Model
-from lnocl.scene.psf_families import spectrum
-from lnocl.scene.psf_pixels import PsfPixels
-from lnocl.scene.scene import Scene
-from lnocl.scene.view import View
-from lnocl.solvers import near_star
-from lnocl.solvers.near_star import NearStar, Surroundings
-from lnocl.solvers.psf_fit import _PixelErrors, _sky
+from lnocl.core.scene.camera import Camera, sampled
+from lnocl.core.scene.estimate import Estimate
+from lnocl.core.scene.forward_model import Model
+from lnocl.core.scene.psf_families import spectrum
+from lnocl.core.scene.psf_pixels import PsfPixels
+from lnocl.core.scene.scene import Scene
+from lnocl.core.scene.view import View
+from lnocl.core.solvers import near_star
+from lnocl.core.solvers.near_star import NearStar, Surroundings
+from lnocl.core.solvers.psf_fit import _PixelErrors, _sky
 
 pytestmark = [
     pytest.mark.filterwarnings("ignore:the images are shifted"),

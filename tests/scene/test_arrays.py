@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from lnocl.core.scene.arrays import whole
 from lnocl.errors import InputError
-from lnocl.scene.arrays import whole
 
 
 @pytest.mark.parametrize("value", [3, 7, np.int64(7), np.uint8(3), np.array(7)])

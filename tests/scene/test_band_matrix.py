@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from lnocl.scene.band_matrix import BandMatrix
+from lnocl.core.scene.band_matrix import BandMatrix
 
 
 def of_dense(dense, places):

@@ -16,7 +16,7 @@ from astropy.nddata import (
 from astropy.utils.masked import Masked
 
 import lnocl
-from lnocl.scene.fields import FIELDS
+from lnocl.core.scene.fields import FIELDS
 
 PSF = np.array([[0.0, 1.0, 0.0], [1.0, 4.0, 2.0]])
 IMAGES = np.arange(1.0, 49.0).reshape(3, 4, 4)

@@ -6,9 +6,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import lnocl
+from lnocl.core.scene.cores import fwhm, off_centre
+from lnocl.core.scene.psfs import FAR_OFF_CENTRE, LITTLE_OFF_CENTRE
 from lnocl.errors import LnoclWarning
-from lnocl.scene.cores import fwhm, off_centre
-from lnocl.scene.psfs import FAR_OFF_CENTRE, LITTLE_OFF_CENTRE
 
 
 def gaussian(shape=(33, 34), width=4.0, x=0.0, y=0.0):

@@ -3,9 +3,9 @@
 import numpy as np
 
 import lnocl
-from lnocl.scene.counts import means
-from lnocl.scene.scene import Scene
-from lnocl.solvers import levels
+from lnocl.core.scene.counts import means
+from lnocl.core.scene.scene import Scene
+from lnocl.core.solvers import levels
 
 BAD = np.arange(2 * 16 * 16).reshape(2, 16, 16) % 3 == 0
 

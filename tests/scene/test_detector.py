@@ -7,10 +7,10 @@ from hypothesis import strategies as st
 from scipy.special import erf
 
 import lnocl
-from lnocl.scene.detector import DetectorPsf, on_sky, seen_psfs
-from lnocl.scene.forward_model import Model
-from lnocl.scene.scene import Scene
-from lnocl.scene.texture import resolution
+from lnocl.core.scene.detector import DetectorPsf, on_sky, seen_psfs
+from lnocl.core.scene.forward_model import Model
+from lnocl.core.scene.scene import Scene
+from lnocl.core.scene.texture import resolution
 
 RNG = np.random.default_rng(24)
 

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 import lnocl
+from lnocl.core.scene.fields import FIELDS
 from lnocl.errors import InputError
-from lnocl.scene.fields import FIELDS
 
 RAMP = 1.0 + np.arange(2 * 8 * 9.0).reshape(2, 8, 9)
 QUARTER = np.array([np.eye(2, 3), [(0.0, -1.0, 8.0), (1.0, 0.0, 0.0)]])

@@ -102,7 +102,7 @@ def test_there_is_none_where_nothing_is_modelled(monkeypatch):
     _, result = solve()
     models = result.models()
     models[0, 2, 3] = 0.0
-    monkeypatch.setattr("lnocl.runs.outcome.Outcome.models", lambda _: iter(models))
+    monkeypatch.setattr("lnocl.core.runs.outcome.Outcome.models", lambda _: iter(models))
     residuals = result.residuals()
     assert np.isnan(residuals[0, 2, 3])
     assert np.isnan(residuals).sum() == 1

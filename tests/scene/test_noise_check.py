@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import lnocl
-from lnocl.scene.noise_check import _some_rows, measure_noise, warn_of_noise, with_noise_shown
+from lnocl.core.scene.noise_check import _some_rows, measure_noise, warn_of_noise, with_noise_shown
 
 SHAPE, LEVEL = (128, 130), 60.0
 Y, X = np.indices(SHAPE) - 64.0

@@ -11,9 +11,9 @@ from astropy.nddata import CCDData, StdDevUncertainty
 from scenes import paper
 
 import lnocl
+from lnocl.core.scene.fields import FIELDS
+from lnocl.core.scene.geometry import MOVES
 from lnocl.errors import InputError
-from lnocl.scene.fields import FIELDS
-from lnocl.scene.geometry import MOVES
 
 PSF = np.array([[0.0, 1.0, 0.0], [1.0, 4.0, 2.0]])
 IMAGES = np.arange(1.0, 49.0).reshape(3, 4, 4)

@@ -7,8 +7,8 @@ import pytest
 from scenes import paper
 
 import lnocl
-from lnocl.scene.padding import choose_pad, recommend_pad
-from lnocl.scene.scene import Scene
+from lnocl.core.scene.padding import choose_pad, recommend_pad
+from lnocl.core.scene.scene import Scene
 
 Y, X = np.indices((41, 41)) - 20
 SIGMA = 3.0

@@ -5,8 +5,8 @@ import pytest
 from scipy.ndimage import fourier_gaussian
 
 import lnocl
-from lnocl.scene.psf_families import PsfFamilies, spectrum
-from lnocl.scene.shifting import place
+from lnocl.core.scene.psf_families import PsfFamilies, spectrum
+from lnocl.core.scene.shifting import place
 
 N = 32
 Y, X = np.indices((N, N)) - N // 2

@@ -5,12 +5,12 @@ import pytest
 from scenes import blur, make_psfs
 
 import lnocl
-from lnocl.scene.estimate import Estimate
-from lnocl.scene.forward_model import Model
-from lnocl.scene.psf_misfit import measure_misfit, smoothing_near_stars
-from lnocl.scene.psf_wings import without_noise
-from lnocl.scene.rings import Rings
-from lnocl.scene.scene import Scene
+from lnocl.core.scene.estimate import Estimate
+from lnocl.core.scene.forward_model import Model
+from lnocl.core.scene.psf_misfit import measure_misfit, smoothing_near_stars
+from lnocl.core.scene.psf_wings import without_noise
+from lnocl.core.scene.rings import Rings
+from lnocl.core.scene.scene import Scene
 
 pytestmark = pytest.mark.filterwarnings("ignore:the images are shifted")
 

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.integrate import quad
 
-from lnocl.scene.psf_pixels import CORRELATED, PsfPixels
+from lnocl.core.scene.psf_pixels import CORRELATED, PsfPixels
 
 
 def pixels(shape=(16, 20)):

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import lnocl
-from lnocl.scene.pupils import Pupil
+from lnocl.core.scene.pupils import Pupil
 from lnocl.simulation import circular_pupil, fizeau_psf, fizeau_pupil
 
 N = 64

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from lnocl.scene.rings import Rings
+from lnocl.core.scene.rings import Rings
 
 SHAPE = (60, 70)
 Y, X = np.indices(SHAPE)

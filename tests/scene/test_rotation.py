@@ -10,8 +10,8 @@ from scenes import worst
 from turned_scenes import gaussian
 
 import lnocl
-from lnocl.scene.rotation import Rotation, turned_psf
-from lnocl.scene.transforms import rotation
+from lnocl.core.scene.rotation import Rotation, turned_psf
+from lnocl.core.scene.transforms import rotation
 
 
 def box(ny, nx):

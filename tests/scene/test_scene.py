@@ -7,9 +7,9 @@ import pytest
 from scenes import Recipe, make_psfs, paper
 
 import lnocl
-from lnocl.scene.grid import MAX_AXIS
-from lnocl.scene.penalty import Penalty
-from lnocl.scene.scene import Scene
+from lnocl.core.scene.grid import MAX_AXIS
+from lnocl.core.scene.penalty import Penalty
+from lnocl.core.scene.scene import Scene
 
 SHAPE = (8, 16)
 OBSERVATION = lnocl.Observation(np.full((2, *SHAPE), 5.0), make_psfs(2, (3, 4)))

@@ -12,7 +12,7 @@ from scenes import gaussian_interpolation, gaussian_variance, make_psfs, worst
 from scipy.ndimage import gaussian_filter
 from scipy.special import erf, j1
 
-from lnocl.scene.shifting import MARGIN, Cutout, MovablePsf, fold, place
+from lnocl.core.scene.shifting import MARGIN, Cutout, MovablePsf, fold, place
 
 GRID = (64, 128)
 ROUNDING = 2e-15

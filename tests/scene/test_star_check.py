@@ -7,9 +7,9 @@ import pytest
 from scenes import paper
 
 import lnocl
+from lnocl.core.scene.scene import Scene
+from lnocl.core.scene.star_check import check_stars, warn_of_stars
 from lnocl.errors import LnoclWarning
-from lnocl.scene.scene import Scene
-from lnocl.scene.star_check import check_stars, warn_of_stars
 
 SIZE, WIDTH, LEVEL = 96, 4.0, 30.0
 STAR = (50, 44)

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from scenes import Recipe
 
-from lnocl.engines.numpy import ReferenceEngine
-from lnocl.runs.start import Setup, make_start
-from lnocl.scene.penalty import Penalty
-from lnocl.scene.star_prior import StarPrior
-from lnocl.solvers import SOLVERS
+from lnocl.core.engines.numpy import ReferenceEngine
+from lnocl.core.runs.start import Setup, make_start
+from lnocl.core.scene.penalty import Penalty
+from lnocl.core.scene.star_prior import StarPrior
+from lnocl.core.solvers import SOLVERS
 
 RECIPE = Recipe((16, 32), 3, 2, masked=0.05, background="each")
 

@@ -5,13 +5,13 @@ import pytest
 from scenes import make_psfs
 
 import lnocl
-from lnocl.runs.inputs import inputs_of
-from lnocl.scene.estimate import Estimate
-from lnocl.scene.forward_model import Model, largest_window
-from lnocl.scene.scene import Scene
-from lnocl.scene.star_check import _masked_stars, check_stars
-from lnocl.solvers.marginal import marginal
-from lnocl.solvers.positions import StarFit, Stars
+from lnocl.core.runs.inputs import inputs_of
+from lnocl.core.scene.estimate import Estimate
+from lnocl.core.scene.forward_model import Model, largest_window
+from lnocl.core.scene.scene import Scene
+from lnocl.core.scene.star_check import _masked_stars, check_stars
+from lnocl.core.solvers.marginal import marginal
+from lnocl.core.solvers.positions import StarFit, Stars
 
 N = 48
 STAR, PLANET = (17.0, 21.0), (26.0, 14.0)

@@ -6,8 +6,8 @@ from astropy import units as u
 from astropy.table import QTable, Table
 
 import lnocl
-from lnocl.scene.star_tables import IN_PIXELS, ON_SKY, find_columns
-from lnocl.scene.stars import check_positions
+from lnocl.core.scene.star_tables import IN_PIXELS, ON_SKY, find_columns
+from lnocl.core.scene.stars import check_positions
 
 OBSERVATION = lnocl.Observation(np.ones((16, 16)), np.eye(1))
 POSITIONS = [(5.5, 7.0), (9.0, 3.0)]

@@ -8,16 +8,16 @@ from astropy import units as u
 from scenes import make_psfs, make_smooth_psfs, paper, worst
 
 import lnocl
-from lnocl.runs.run import Run
-from lnocl.runs.start import Setup, make_start
-from lnocl.scene import shifting
-from lnocl.scene import stars as star_images
-from lnocl.scene.estimate import Estimate
-from lnocl.scene.penalty import Penalty
-from lnocl.scene.scene import Scene
-from lnocl.scene.shifting import Cutout
-from lnocl.scene.stars import Order, StarImages, check_positions, order_of
-from lnocl.scene.view import View, Window
+from lnocl.core.runs.run import Run
+from lnocl.core.runs.start import Setup, make_start
+from lnocl.core.scene import shifting
+from lnocl.core.scene import stars as star_images
+from lnocl.core.scene.estimate import Estimate
+from lnocl.core.scene.penalty import Penalty
+from lnocl.core.scene.scene import Scene
+from lnocl.core.scene.shifting import Cutout
+from lnocl.core.scene.stars import Order, StarImages, check_positions, order_of
+from lnocl.core.scene.view import View, Window
 
 # One is alone, two are neighbours, one wraps round two edges; or all of the grid is covered.
 FIELDS = {
@@ -188,7 +188,7 @@ class NoEngine:
 @pytest.mark.parametrize("solver", ["sgm", "sgp"])
 def test_memory_does_not_grow_as_stars_times_pixels(refines, solver, monkeypatch):
     """That of all before the first iteration but the engine. Measured 0.13 to 0.62, once 2 to 4."""
-    monkeypatch.setattr("lnocl.runs.run._make_engine", lambda *_: NoEngine())
+    monkeypatch.setattr("lnocl.core.runs.run._make_engine", lambda *_: NoEngine())
     rng, size, n = np.random.default_rng(3), 256, 100
     stars = rng.uniform(20, size - 20, (n, 2))
     observation = lnocl.Observation(rng.poisson(20.0, (size, size)), make_smooth_psfs(1, (15, 15)))

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 import lnocl
-from lnocl.scene import texture
-from lnocl.scene.scene import Scene
-from lnocl.scene.texture import Texture, hidden_radii, resolution
+from lnocl.core.scene import texture
+from lnocl.core.scene.scene import Scene
+from lnocl.core.scene.texture import Texture, hidden_radii, resolution
 
 N = 64
 Y, X = np.indices((N, N), float)

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import scipy.optimize
 
-from lnocl.scene.band_matrix import BandMatrix
-from lnocl.solvers.fluxes import MAX_FADING, bounded_step, variances
+from lnocl.core.scene.band_matrix import BandMatrix
+from lnocl.core.solvers.fluxes import MAX_FADING, bounded_step, variances
 
 # Two stars whose images overlap by this share, in units far apart.
 UNITS = np.array([1.0, 1e6])

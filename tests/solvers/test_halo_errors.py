@@ -6,13 +6,13 @@ from scenes import make_psfs
 from scipy.ndimage import gaussian_filter
 
 import lnocl
-from lnocl.scene.estimate import Estimate
-from lnocl.scene.forward_model import Model
-from lnocl.scene.scene import Scene
-from lnocl.scene.texture import Texture, resolution
-from lnocl.solvers import halos, least_squares, near_star
-from lnocl.solvers.halos import halo_errors
-from lnocl.solvers.star_errors import standard_errors
+from lnocl.core.scene.estimate import Estimate
+from lnocl.core.scene.forward_model import Model
+from lnocl.core.scene.scene import Scene
+from lnocl.core.scene.texture import Texture, resolution
+from lnocl.core.solvers import halos, least_squares, near_star
+from lnocl.core.solvers.halos import halo_errors
+from lnocl.core.solvers.star_errors import standard_errors
 
 N, P = 32, 2
 Y, X = np.indices((N, N), float)

@@ -7,13 +7,13 @@ import sys
 import numpy as np
 import pytest
 
-from lnocl.solvers import least_squares
-from lnocl.solvers.least_squares import LeastSquares, LevelError, LinearImage
+from lnocl.core.solvers import least_squares
+from lnocl.core.solvers.least_squares import LeastSquares, LevelError, LinearImage
 
 SCRIPT = """
 import hashlib
 import numpy as np
-from lnocl.solvers.least_squares import LeastSquares, LinearImage
+from lnocl.core.solvers.least_squares import LeastSquares, LinearImage
 
 class Field:
     at = np.zeros((256, 256))

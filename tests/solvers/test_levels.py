@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 
 import lnocl
-from lnocl.scene.estimate import Estimate
-from lnocl.scene.forward_model import Model
-from lnocl.scene.scene import Scene
-from lnocl.solvers.levels import Levels
-from lnocl.solvers.light import Light
-from lnocl.solvers.marginal import marginal
-from lnocl.solvers.star_errors import standard_errors
+from lnocl.core.scene.estimate import Estimate
+from lnocl.core.scene.forward_model import Model
+from lnocl.core.scene.scene import Scene
+from lnocl.core.solvers.levels import Levels
+from lnocl.core.solvers.light import Light
+from lnocl.core.solvers.marginal import marginal
+from lnocl.core.solvers.star_errors import standard_errors
 
 N = 48
 Y, X = np.indices((N, N), float)
@@ -110,7 +110,7 @@ def test_a_known_level_stays_and_has_no_error():
 
 
 def test_the_error_of_a_sum_is_that_of_draws(monkeypatch):
-    monkeypatch.setattr("lnocl.solvers.levels.SHARE", 1e-6)
+    monkeypatch.setattr("lnocl.core.solvers.levels.SHARE", 1e-6)
     source = np.where(SKY > 4.0, SKY, 0.0)  # without wings
     rng, found, stated = np.random.default_rng(44), [], []
     regions = [(np.hypot(X - 25, Y - 20) < radius).astype(float) for radius in (8, 20, 60)]

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 import lnocl
-from lnocl.scene.estimate import Estimate
-from lnocl.scene.forward_model import Model
-from lnocl.scene.scene import Scene
-from lnocl.solvers.marginal import marginal
+from lnocl.core.scene.estimate import Estimate
+from lnocl.core.scene.forward_model import Model
+from lnocl.core.scene.scene import Scene
+from lnocl.core.solvers.marginal import marginal
 
 N = 48
 Y, X = np.indices((N, N)) - N // 2

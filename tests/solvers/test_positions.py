@@ -14,14 +14,14 @@ from scipy.optimize import minimize
 from scipy.special import kl_div
 
 import lnocl
-from lnocl.runs.run import Run
-from lnocl.runs.start import Setup, make_start
-from lnocl.scene.forward_model import Model
-from lnocl.scene.penalty import Penalty
-from lnocl.scene.scene import Scene
-from lnocl.scene.stars import MAX_SHIFT
-from lnocl.solvers import fluxes, positions, scaling
-from lnocl.solvers.positions import StarFit, Stars
+from lnocl.core.runs.run import Run
+from lnocl.core.runs.start import Setup, make_start
+from lnocl.core.scene.forward_model import Model
+from lnocl.core.scene.penalty import Penalty
+from lnocl.core.scene.scene import Scene
+from lnocl.core.scene.stars import MAX_SHIFT
+from lnocl.core.solvers import fluxes, positions, scaling
+from lnocl.core.solvers.positions import StarFit, Stars
 
 # PSFs here are small, and whole offsets periodic.
 pytestmark = pytest.mark.filterwarnings(
@@ -435,7 +435,7 @@ def test_rules_go_with_refinement_exposures_and_offsets(stop, recipe):
 
 def test_discrepancy_knows_where_the_stars_are():
     """Its expectation at the end is that of the last model."""
-    from lnocl.runs.stopping import Discrepancy, expected_deviance
+    from lnocl.core.runs.stopping import Discrepancy, expected_deviance
 
     ratios = []
     rule = Discrepancy()

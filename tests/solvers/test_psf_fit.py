@@ -5,11 +5,11 @@ import pytest
 from scipy.ndimage import gaussian_filter
 
 import lnocl
-from lnocl.scene.estimate import Estimate
-from lnocl.scene.forward_model import Model
-from lnocl.scene.psf_families import PsfFamilies, PsfParameters
-from lnocl.scene.scene import Scene
-from lnocl.solvers import least_squares, psf_fit
+from lnocl.core.scene.estimate import Estimate
+from lnocl.core.scene.forward_model import Model
+from lnocl.core.scene.psf_families import PsfFamilies, PsfParameters
+from lnocl.core.scene.scene import Scene
+from lnocl.core.solvers import least_squares, psf_fit
 
 N, P = 16, 2
 Y, X = np.indices((N, N)) - N // 2

@@ -8,12 +8,12 @@ from explicit_matrix import problem_of
 from scenes import Recipe, make_psfs, make_smooth_psfs, worst
 
 import lnocl
-from lnocl.engines.numpy import ReferenceEngine
-from lnocl.scene.forward_model import Model
-from lnocl.scene.penalty import Penalty
-from lnocl.scene.scene import Scene
-from lnocl.solvers import scaling
-from lnocl.solvers.fluxes import fit_fluxes
+from lnocl.core.engines.numpy import ReferenceEngine
+from lnocl.core.scene.forward_model import Model
+from lnocl.core.scene.penalty import Penalty
+from lnocl.core.scene.scene import Scene
+from lnocl.core.solvers import scaling
+from lnocl.core.solvers.fluxes import fit_fluxes
 
 TINY = Recipe((8, 8), 2, 2, mu=1e-3, masked=0.1, background="map", psf_shape=(3, 4))
 

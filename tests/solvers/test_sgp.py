@@ -15,12 +15,12 @@ from hypothesis import strategies as st
 from scenes import FEWER_ENGINES, NUMPY_FIRST, Recipe, blur, make_psfs, paper, same, worst
 
 import lnocl
-from lnocl.engines import numpy as reference
-from lnocl.engines import opencl
-from lnocl.scene.forward_model import Model
-from lnocl.scene.penalty import Penalty
-from lnocl.scene.scene import Scene
-from lnocl.solvers import scaling
+from lnocl.core.engines import numpy as reference
+from lnocl.core.engines import opencl
+from lnocl.core.scene.forward_model import Model
+from lnocl.core.scene.penalty import Penalty
+from lnocl.core.scene.scene import Scene
+from lnocl.core.solvers import scaling
 
 every_engine = pytest.mark.parametrize("engine", FEWER_ENGINES)
 
@@ -335,7 +335,7 @@ def test_estimate_is_the_last_good_one_where_no_step_is_left(engine, monkeypatch
 
     def refuse_all_steps(iteration, _):
         if iteration == 3:
-            monkeypatch.setattr("lnocl.solvers.sgp.SUFFICIENT", 1e300)
+            monkeypatch.setattr("lnocl.core.solvers.sgp.SUFFICIENT", 1e300)
 
     expected = run(name, n_iter=3, **engine)
     result = run(name, n_iter=9, callback=refuse_all_steps, **engine)

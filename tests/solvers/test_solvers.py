@@ -6,9 +6,9 @@ from itertools import chain, repeat
 import numpy as np
 import pytest
 
+from lnocl.core.solvers.sgm import sgm
+from lnocl.core.solvers.sgp import Steps, sgp
 from lnocl.errors import NotFiniteError
-from lnocl.solvers.sgm import sgm
-from lnocl.solvers.sgp import Steps, sgp
 
 
 class Scripted:

@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 
 import lnocl
-from lnocl.scene.estimate import Estimate
-from lnocl.scene.forward_model import Model
-from lnocl.scene.scene import Scene
-from lnocl.scene.texture import Texture, resolution
-from lnocl.scene.view import View, Window
-from lnocl.solvers import least_squares, near_star
-from lnocl.solvers.star_errors import standard_errors
+from lnocl.core.scene.estimate import Estimate
+from lnocl.core.scene.forward_model import Model
+from lnocl.core.scene.scene import Scene
+from lnocl.core.scene.texture import Texture, resolution
+from lnocl.core.scene.view import View, Window
+from lnocl.core.solvers import least_squares, near_star
+from lnocl.core.solvers.star_errors import standard_errors
 
 N = 32
 Y, X = np.indices((N, N), float)

@@ -7,9 +7,9 @@ import pytest
 
 from lnocl import __version__
 from lnocl.commands import cli
+from lnocl.core.opencl import device, program
+from lnocl.core.runs.start import Setup
 from lnocl.errors import DeviceError
-from lnocl.opencl import device, program
-from lnocl.runs.start import Setup
 from lnocl.studies import selftest
 from lnocl.studies.selftest import Row
 
@@ -128,7 +128,7 @@ def test_the_scenes_have_every_option_of_the_kernels(monkeypatch):
         given.append(options)
         raise Built
 
-    monkeypatch.setattr("lnocl.engines.opencl.Program", build)
+    monkeypatch.setattr("lnocl.core.engines.opencl.Program", build)
     for case in selftest.cases().values():
         with pytest.raises(Built):
             selftest._reconstruct(case, "sgm", 1, "single", "opencl", None)

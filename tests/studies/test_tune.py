@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from lnocl.opencl.device import choose, has_double
-from lnocl.opencl.tuning import Tuning, candidates
+from lnocl.core.opencl.device import choose, has_double
+from lnocl.core.opencl.tuning import Tuning, candidates
 from lnocl.studies import tuning
 from lnocl.studies.tuning import Timed, fastest
 

@@ -16,9 +16,9 @@ from kernel_cases import of_gpu
 from kernel_harness import THREE_IMAGES, TURNED
 from kernel_scenes import FOUR_TIMES_AS_FINE, SCENES
 
-from lnocl.opencl import program
-from lnocl.opencl.device import choose, context_of
-from lnocl.opencl.sources import source
+from lnocl.core.opencl import program
+from lnocl.core.opencl.device import choose, context_of
+from lnocl.core.opencl.sources import source
 
 pytestmark = [pytest.mark.system]
 

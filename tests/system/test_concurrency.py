@@ -15,8 +15,8 @@ from runtimes import on_pocl
 from scenes import paper
 
 import lnocl
+from lnocl.core.runs.thinning import split_counts
 from lnocl.io.fitsread import read_stack
-from lnocl.runs.thinning import split_counts
 
 pytestmark = pytest.mark.system
 

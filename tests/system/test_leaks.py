@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from lnocl.engines import opencl
+from lnocl.core.engines import opencl
 
 BENCHMARKS = str(Path(__file__).parents[2] / "benchmarks")
 pytestmark = pytest.mark.system

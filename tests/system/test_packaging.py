@@ -151,7 +151,7 @@ def test_installed(built, kind, tmp_path):
     python, site = environment(tmp_path, *target, within=within)
     code = (
         "import lnocl, lnocl.commands.cli\n"
-        "from lnocl.opencl import sources\n"
+        "from lnocl.core.opencl import sources\n"
         "print(lnocl.__file__, *(file.name for file in sources.folder().iterdir()))"
     )
     found, *files = run(python, "-I", "-c", code, cwd=tmp_path).split()
@@ -167,7 +167,7 @@ def test_installed(built, kind, tmp_path):
         )
         mypy = [sys.executable, "-m", "mypy", "--python-executable", python]
         mypy += ["--warn-unused-ignores", "user.py"]
-        assert "observation: lnocl.scene.observation.Observation" in run(*mypy, cwd=tmp_path)
+        assert "observation: lnocl.core.scene.observation.Observation" in run(*mypy, cwd=tmp_path)
 
 
 @pytest.mark.parametrize(

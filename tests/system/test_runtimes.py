@@ -3,7 +3,7 @@
 import pytest
 from scenes import Recipe, worst
 
-from lnocl.opencl.device import find_devices, spec_of
+from lnocl.core.opencl.device import find_devices, spec_of
 
 pytestmark = pytest.mark.system
 

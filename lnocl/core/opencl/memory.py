@@ -1,0 +1,245 @@
+"""Named buffers on a device, and numbers on their way between it and the host."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import suppress
+from pathlib import Path
+
+import numpy as np
+import pyopencl as cl
+from numpy.typing import NDArray
+
+from lnocl.core.opencl.device import describe
+from lnocl.core.opencl.launch import READ_WRITE
+from lnocl.core.opencl.layout import Layout
+from lnocl.core.scene.arrays import Array
+from lnocl.errors import DeviceError, InputError, note
+
+# Bytes of pixels that are converted and copied at once, lest a second array of all is needed.
+MAX_COPIED = 16 * 2**20
+# And bytes from which on a copy costs more than the call.
+MIN_COPIED = 2**20
+
+
+class Transfer:
+    """Numbers on their way from the device, which works on meanwhile.
+
+    Parameters
+    ----------
+    queue : pyopencl.CommandQueue
+        In whose order they are read.
+    dtype : numpy.dtype
+        Of the numbers.
+    *ranges : tuple of (pyopencl.Buffer, int, int)
+        Places of the numbers: the buffer, the first byte, and the number of bytes.
+    """
+
+    def __init__(
+        self, queue: cl.CommandQueue, dtype: np.dtype, *ranges: tuple[cl.Buffer, int, int]
+    ) -> None:
+        self._arrays = [np.empty(size // dtype.itemsize, dtype) for _, _, size in ranges]
+        self._events = [
+            cl.enqueue_copy(queue, array, buffer, src_offset=offset, is_blocking=False)
+            for array, (buffer, offset, _) in zip(self._arrays, ranges, strict=True)
+        ]
+
+    def wait(self) -> list[Array]:
+        """Return the arrays, as float64, when they have arrived."""
+        cl.wait_for_events(self._events)
+        return [array.astype(np.float64) for array in self._arrays]
+
+
+class Memory:
+    """The buffers of a scene on a device, by name.
+
+    Parameters
+    ----------
+    queue : pyopencl.CommandQueue
+        For transfers.
+    layout : Layout
+        Of arrays of pixels.
+    scale : float
+        Electrons per unit, for messages.
+
+    Attributes
+    ----------
+    buffers : dict of str to pyopencl.Buffer
+        All of them.
+    """
+
+    def __init__(self, queue: cl.CommandQueue, layout: Layout, scale: float) -> None:
+        self._queue, self._layout, self._scale = queue, layout, scale
+        self.buffers: dict[str, cl.Buffer] = {}
+
+    def allocate(self, **sizes: int) -> None:
+        """Make buffers of so many bytes, in the place of those with the same names."""
+        for name, size in sizes.items():
+            self.buffers.pop(name, None)  # first, lest the memory of both is taken
+            self.buffers[name] = cl.Buffer(self._queue.context, READ_WRITE, size)
+
+    def copy(self, one: str, other: str) -> None:
+        """Copy a buffer to another of the same size."""
+        size = int(self.buffers[one].size)
+        cl.enqueue_copy(self._queue, self.buffers[other], self.buffers[one], byte_count=size)
+
+    def clear(self, name: str) -> None:
+        """Set all of a buffer to 0."""
+        buffer = self.buffers[name]
+        cl.enqueue_fill_buffer(self._queue, buffer, np.zeros(1, self._layout.dtype), 0, buffer.size)
+
+    def exchange(self, one: str, other: str) -> None:
+        """Exchange the names of two buffers."""
+        buffers = self.buffers
+        buffers[one], buffers[other] = buffers[other], buffers[one]
+
+    def upload(self, name: str, values: NDArray) -> None:
+        """Copy numbers to a buffer, in the precision of the device."""
+        if np.size(values):
+            cl.enqueue_copy(self._queue, self.buffers[name], self._rounded(name, values))
+
+    def upload_integers(self, name: str, values: NDArray) -> None:
+        """Copy whole numbers of 32 bits to a buffer."""
+        if len(values):
+            cl.enqueue_copy(self._queue, self.buffers[name], values.astype(np.int32))
+
+    def upload_pixels(self, name: str, arrays: Iterable[NDArray]) -> None:
+        """Copy arrays of pixels, or of some blocks' rows, to a buffer, one behind the other."""
+        offset = 0
+        for pixels in self._copied_at_once(arrays):
+            packed = self._layout.pack_pixels(self._rounded(name, pixels))
+            cl.enqueue_copy(self._queue, self.buffers[name], packed, dst_offset=offset)
+            offset += packed.nbytes
+
+    def _copied_at_once(self, arrays: Iterable[NDArray]) -> Iterator[NDArray]:
+        """Yield several small arrays together, and large ones in parts of some rows."""
+        small = list[NDArray]()
+        for array in arrays:
+            small.append(array)
+            if array.nbytes * len(small) < MIN_COPIED:
+                continue
+            if len(small) > 1:
+                yield np.array(small)
+            else:
+                slices = self._layout.row_slices(len(array), MAX_COPIED)
+                yield from (array[rows] for rows in slices)
+            small.clear()
+        if small:
+            yield np.array(small)
+
+    def download(self, name: str, count: int) -> Array:
+        """Return the first numbers in a buffer, as float64."""
+        values = np.empty(count, self._layout.dtype)
+        if count:
+            cl.enqueue_copy(self._queue, values, self.buffers[name])
+        return values.astype(np.float64)
+
+    def download_pixels(self, name: str) -> Array:
+        """Return the one array of pixels that a buffer holds, as float64."""
+        pixels, offset = np.empty(self._layout.grid), 0
+        for rows in self._layout.row_slices(len(pixels), MAX_COPIED):
+            packed = np.empty(pixels[rows].size, self._layout.dtype)
+            cl.enqueue_copy(self._queue, packed, self.buffers[name], src_offset=offset)
+            pixels[rows] = self._layout.unpack_pixels(packed)
+            offset += packed.nbytes
+        return pixels
+
+    def download_raw(self, name: str) -> NDArray:
+        """Return all of a buffer as it lies on the device."""
+        values = np.empty(self.count(name), self._layout.dtype)
+        cl.enqueue_copy(self._queue, values, self.buffers[name])
+        return values
+
+    def upload_raw(self, name: str, values: NDArray) -> None:
+        """Copy what `download_raw` returned, or the first of it, back."""
+        if values.size:
+            cl.enqueue_copy(self._queue, self.buffers[name], values)
+
+    def fetch(self, *names: str) -> Transfer:
+        """Send for all that some buffers hold."""
+        return self.fetch_ranges(*((name, 0, self.count(name)) for name in names))
+
+    def fetch_ranges(self, *ranges: tuple[str, int, int]) -> Transfer:
+        """Send for ranges of buffers: name, first number, and how many numbers."""
+        item = self._layout.dtype.itemsize
+        return Transfer(
+            self._queue,
+            self._layout.dtype,
+            *((self.buffers[name], first * item, count * item) for name, first, count in ranges),
+        )
+
+    def count(self, name: str) -> int:
+        """Return how many numbers a buffer holds."""
+        return int(self.buffers[name].size) // self._layout.dtype.itemsize
+
+    def _rounded(self, name: str, values: NDArray | float) -> NDArray:
+        """Return values in the precision of the device; refuse values too large for it."""
+        dtype = self._layout.dtype
+        with np.errstate(over="ignore"):
+            rounded = np.asarray(values).astype(dtype)
+        if not np.isfinite(rounded).all():
+            raise InputError(
+                f"{name.replace('_', ' ')} as large as {np.abs(values).max() * self._scale:g} "
+                f"cannot be held in {dtype}: scale the scene, or take `precision` double"
+            )
+        return rounded
+
+
+def refuse_if_too_large(device: cl.Device, sizes: Mapping[str, int], count: int) -> int:
+    """Return the bytes of all buffers together.
+
+    Parameters
+    ----------
+    device : pyopencl.Device
+        The device.
+    sizes : mapping of str to int
+        Bytes of each buffer.
+    count : int
+        How many such sets of buffers it is to hold.
+
+    Raises
+    ------
+    DeviceError
+        The device has too little memory, or gives too little at once for the largest buffer.
+    """
+    total = sum(sizes.values())
+    largest = max(sizes, key=lambda name: sizes[name])
+    if count * total > device.global_mem_size or sizes[largest] > device.max_mem_alloc_size:
+        raise DeviceError(
+            f"the scene needs {count * total / 2**20:.0f} MiB, {sizes[largest] / 2**20:.0f} MiB of "
+            f"it for {largest}; {describe(device)} has {device.global_mem_size / 2**20:.0f} MiB "
+            f"and gives {device.max_mem_alloc_size / 2**20:.0f} MiB at once: take fewer or "
+            "smaller images, fewer stars, `precision` single, or another `device`"
+        )
+    return total
+
+
+def held_bytes() -> tuple[int, int]:
+    """Return the bytes of memory that this process holds, and the most that it has held.
+
+    Where only the second is known they are the same; where neither is, they are 0.
+    """
+    with suppress(OSError, StopIteration):
+        lines = Path("/proc/self/status").read_text(encoding="ascii", errors="replace").split("\n")
+        held, most = (
+            1024 * next(int(line.split()[1]) for line in lines if line.startswith(name))
+            for name in ("VmRSS:", "VmHWM:")
+        )
+        return held, most
+    try:
+        import resource
+    except ImportError:  # on Windows
+        return 0, 0
+    most = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss  # bytes on a Mac
+    return most, most
+
+
+def announce(device: cl.Device, device_bytes: int, host_bytes: int, tuned: str) -> None:
+    """Log what a scene takes on a device and on the host, and the tuning of the device."""
+    note(
+        "%s: the scene takes %.1f MiB there, and up to %.0f MiB of the host's memory; %s",
+        describe(device),
+        device_bytes / 2**20,
+        host_bytes / 2**20,
+        tuned,
+    )

@@ -1,0 +1,335 @@
+"""Building the kernels for a device and a scene, with the tuning that the device calls for."""
+
+from __future__ import annotations
+
+import math
+import mmap
+import os
+import re
+import weakref
+from collections import OrderedDict
+from collections.abc import Mapping
+from pathlib import Path
+from typing import cast
+
+import numpy as np
+import pyopencl as cl
+
+from lnocl.core.opencl import kernel_cache, trial, unknown_cpu
+from lnocl.core.opencl.device import describe, has_double
+from lnocl.core.opencl.faults import after_fault, build_failure
+from lnocl.core.opencl.sources import source
+from lnocl.core.opencl.tuning import Tuning, odd_part, tune
+from lnocl.core.scene.line_weights import TAPS
+from lnocl.core.scene.rotation import PHASE_ROWS
+from lnocl.errors import DeviceError
+from lnocl.process import LOCK, ignored_warnings
+
+# Groups a compute unit that have a scratch in global memory, where groups have several work-items.
+GROUPS_A_UNIT = 4
+
+# Pairs of rows in a piece of a column, where an image is sheared.
+COLUMN_PAIRS = 64
+
+# Built programs that a process holds, the last used; each takes some 3 MiB.
+MAX_PROGRAMS = 16
+
+# Bytes of addresses with which PoCL builds and launches kernels for sure. With too few it fails
+# while it holds its locks, and waits for them as the process ends.
+ROOM = 512 * 2**20
+
+
+def radices(n: int) -> tuple[int, int, int]:
+    """Return the odd factor of n points, and the radices of the outer and the last pass.
+
+    Those between are 8.
+    """
+    odd = odd_part(n)
+    outer = odd if odd > 1 else 4 if n > 2 and n.bit_length() % 3 == 2 else min(8, n)
+    last = n // outer
+    while last > 8:
+        last //= 8
+    return odd, outer, last
+
+
+class Program:
+    """The kernels for one device, grid and scene.
+
+    A process builds each program once; every instance has kernels of its own, which hold their
+    own arguments.
+
+    Parameters
+    ----------
+    context : pyopencl.Context
+        Of one device.
+    grid : tuple of int
+        Shape (Ny, Nx) of the sky, of `lnocl.core.scene.grid.LENGTHS`.
+    dtype : numpy.dtype
+        float32 or float64.
+    tuning : Tuning, optional
+        By default that of `lnocl.core.opencl.tuning.tune`.
+    oversample : int, optional
+        Pixels of the sky to one of the images, along each axis: 1, 2 or 4.
+    has_mu, has_smoothing, has_smoothing_map : bool, optional
+    has_weights, has_background_map, has_exposure_map, has_turns : bool, optional
+        Parts that the scene has.
+    min_model : float, optional
+        The division guard.
+
+    Attributes
+    ----------
+    options : list of str
+        The build options.
+    arguments : dict of str to tuple of str
+        The names of each kernel's arguments, in the order of its declaration.
+    image_grid : tuple of int
+        Shape of the images' grid.
+    radices : dict of str to tuple of int
+        Those of each transform: "row", "column", "image_row" and "image_column".
+    rows : int
+        Rows that a block of spectra takes in memory.
+    max_groups : int
+        Work-groups that have a scratch in global memory; 0 where it is local.
+
+    Raises
+    ------
+    DeviceError
+        The device has no double precision and float64 is asked of it, or its compiler fails.
+    """
+
+    def __init__(
+        self,
+        context: cl.Context,
+        grid: tuple[int, int],
+        dtype: np.dtype,
+        tuning: Tuning | None = None,
+        *,
+        oversample: int = 1,
+        has_mu: bool = False,
+        has_smoothing: bool = False,
+        has_smoothing_map: bool = False,
+        has_weights: bool = False,
+        has_background_map: bool = False,
+        has_exposure_map: bool = False,
+        has_turns: bool = False,
+        min_model: float = 0.0,
+    ) -> None:
+        device = context.devices[0]
+        self.context, self.grid, self.dtype = context, grid, dtype
+        if dtype == np.float64 and not has_double(device):
+            raise DeviceError(
+                f"{describe(device)} has no double precision; take `precision` single, or another "
+                "device"
+            )
+        self.tuning = tuning or tune(device, dtype, grid, oversample, has_turns)
+        self.has_turns, self.phase_rows = has_turns, math.gcd(grid[0], PHASE_ROWS)
+        self.oversample = oversample
+        self.image_grid = grid[0] // oversample, grid[1] // oversample
+        self.rows = grid[0] + self.tuning.padding
+        a_unit = GROUPS_A_UNIT if self.tuning.group > 1 else 1
+        self.max_groups = a_unit * device.max_compute_units * self.tuning.scratch_is_global
+        lengths = {"row": grid[1], "column": grid[0]}
+        lengths |= {"image_row": self.image_grid[1], "image_column": self.image_grid[0]}
+        self.radices = {name: radices(n) for name, n in lengths.items()}
+        constants = {
+            "REAL": "double" if dtype == np.float64 else "float",
+            "BITS": "long" if dtype == np.float64 else "int",
+            "LANES": self.tuning.lanes,
+            "BLOCK": self.tuning.block,
+            "GROUP": self.tuning.group,
+            **{
+                f"{name.upper()}_{part}": value
+                for name, each in self.radices.items()
+                for part, value in zip(("ODD", "OUTER", "LAST"), each, strict=True)
+            },
+            "CHUNK": self.tuning.chunk,
+            "SCRATCH_IS_GLOBAL": int(self.tuning.scratch_is_global),
+            "SCRATCH_BLOCKS": self.tuning.scratch_blocks,
+            "HAS_BUILTIN_PREFETCH": int(_has_builtin_prefetch(device)),
+            "NX": grid[1],
+            "NY": grid[0],
+            "OVERSAMPLE": oversample,
+            "ROWS": self.rows,
+            "HAS_MU": int(has_mu),
+            "HAS_SMOOTHING": int(has_smoothing),
+            "HAS_SMOOTHING_MAP": int(has_smoothing_map),
+            "HAS_WEIGHTS": int(has_weights),
+            "HAS_BACKGROUND_MAP": int(has_background_map),
+            "HAS_EXPOSURE_MAP": int(has_exposure_map),
+            "HAS_TURNS": int(has_turns),
+            "TURN_TAPS": TAPS,
+            "PHASE_ROWS": self.phase_rows,
+            "COLUMN_PAIRS": self.column_pairs,
+            "MIN_MODEL": f"{min_model!r}",
+        }
+        definitions = [f"-D{name}={value}" for name, value in constants.items()]
+        self.options = ["-cl-std=CL1.2", "-w", *definitions]
+        text = source()
+        self._built = _build(context, text, tuple(self.options))
+        self.arguments = _arguments(text, self._built.kernel_names)
+        self._kernels: dict[str, cl.Kernel] = {}
+        weakref.finalize(self, self._built.store)
+
+    def kernel(self, name: str) -> cl.Kernel:
+        """Return a kernel, always the same one."""
+        if name not in self._kernels:
+            self._kernels[name] = cl.Kernel(self._built.program, name)
+            self._built.used.add(name)
+        return self._kernels[name]
+
+    @property
+    def row_blocks(self) -> int:
+        """Blocks of row pairs in an array of pixels of the sky."""
+        return self.grid[0] // 2 // self.tuning.block
+
+    @property
+    def image_row_blocks(self) -> int:
+        """Blocks of row pairs in an image."""
+        return self.image_grid[0] // 2 // self.tuning.block
+
+    @property
+    def column_blocks(self) -> int:
+        """Blocks of columns in an array of spectra."""
+        return self.grid[1] // 2 // self.tuning.block
+
+    @property
+    def column_pairs(self) -> int:
+        """Pairs of rows in a piece of a column: see kernels/turn.cl."""
+        return math.gcd(self.grid[0] // 2, COLUMN_PAIRS)
+
+    @property
+    def columns_size(self) -> int:
+        """Reals that the columns of an image take, which kernels/turn.cl shears."""
+        pairs, (ny, nx), block = self.column_pairs, self.grid, self.tuning.block
+        copied = -(-(self.tuning.lanes + TAPS // 2) // block) * block
+        return ny // pairs * nx * (pairs + copied)
+
+    @property
+    def scratch_bytes(self) -> int:
+        """Bytes that a work-group needs for its block."""
+        points = self.tuning.scratch_points(self.grid, self.oversample, self.has_turns)
+        return points * 2 * self.tuning.block * self.dtype.itemsize
+
+
+def _has_builtin_prefetch(device: cl.Device) -> bool:
+    """Return whether a device's compiler is known to take clang's builtin."""
+    return device.platform.name == unknown_cpu.POCL and bool(device.type & cl.device_type.CPU)
+
+
+def _arguments(text: str, kernel_names: list[str]) -> Mapping[str, tuple[str, ...]]:
+    """Return the names of the arguments that the source declares for each kernel."""
+    declared = dict(re.findall(r"^KERNEL void (\w+)\(([^)]*)\)", text, re.MULTILINE))
+    return {
+        name: tuple(re.findall(r"(\w+)\s*(?:,|$)", declared[name].strip())) for name in kernel_names
+    }
+
+
+class _Built:
+    """A built program, and the file that later processes have it from."""
+
+    def __init__(
+        self, context: cl.Context, text: str, options: tuple[str, ...], file: Path
+    ) -> None:
+        self._file, self._process = file, os.getpid()
+        self._content = kernel_cache.read(file)
+        self._is_pocl = context.devices[0].platform.name == unknown_cpu.POCL
+        if self._is_pocl:
+            self._folders = kernel_cache.unpack(self._content)
+            before = kernel_cache.folders()
+            self.program = _compile(context, text, options)
+            self._folders |= kernel_cache.folders() - before
+        else:
+            self.program = self._load(context, options) or _compile(context, text, options)
+        # Not by all_kernels: its kernels are retained once too often, and stay with their program.
+        self.kernel_names = str(self.program.get_info(cl.program_info.KERNEL_NAMES)).split(";")
+        self.used: set[str] = set()
+        self._looked_at: set[str] = set()
+
+    def _load(self, context: cl.Context, options: tuple[str, ...]) -> cl.Program | None:
+        if not self._content:
+            return None
+        try:
+            program = cl.Program(context, context.devices, [self._content])
+            return _quietly_built(program, options)
+        except cl.Error:
+            kernel_cache.discard(self._file)
+            return None
+
+    def store(self) -> None:
+        """Store the program, if there is more of it than before.
+
+        PoCL compiles each kernel as it is first launched. Its binaries are not asked for: it would
+        compile all kernels once more, for groups of any size.
+        """
+        if self.used <= self._looked_at or os.getpid() != self._process:
+            return
+        with LOCK:
+            self._looked_at |= self.used
+            if self._is_pocl:
+                try:
+                    content = kernel_cache.pack(self._folders)
+                except OSError:  # files there are gone
+                    return
+            else:
+                (content,) = cast(list[bytes], self.program.get_info(cl.program_info.BINARIES))
+            if content != self._content and kernel_cache.can_write(self._file.parent):
+                kernel_cache.write(self._file, content)
+                self._content = content
+
+
+_programs: OrderedDict[tuple[cl.Context, str, tuple[str, ...]], _Built] = OrderedDict()
+
+
+def _build(context: cl.Context, text: str, options: tuple[str, ...]) -> _Built:
+    """Return a program that the process has, that a file holds, or that is compiled now."""
+    key = context, text, options
+    with LOCK:
+        if key not in _programs:
+            _need_room(context.devices[0])
+            unknown_cpu.name_level(context.devices[0])
+            trial.check(context.devices[0])
+            name = "\n".join([describe(context.devices[0]), *options, text])
+            _programs[key] = _Built(context, text, options, kernel_cache.file_of(name))
+            while len(_programs) > MAX_PROGRAMS:
+                _programs.popitem(last=False)
+        _programs.move_to_end(key)
+        return _programs[key]
+
+
+def _need_room(device: cl.Device) -> None:
+    """Refuse to compile with PoCL where addresses are too few.
+
+    Raises
+    ------
+    DeviceError
+        They are.
+    """
+    if device.platform.name != unknown_cpu.POCL or not hasattr(mmap, "MAP_PRIVATE"):
+        return
+    try:
+        mmap.mmap(-1, ROOM, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS).close()
+    except OSError as error:
+        raise DeviceError(
+            f"PoCL needs {ROOM // 2**20} MiB of addresses more than this process may have: raise "
+            "the limit of memory (ulimit -v), or take `engine` numpy"
+        ) from error
+
+
+@after_fault
+def forget_programs() -> None:
+    """Let all programs go, as after a fault of a device, whose context may be lost."""
+    with LOCK:
+        _programs.clear()
+
+
+def _compile(context: cl.Context, text: str, options: tuple[str, ...]) -> cl.Program:
+    try:
+        return _quietly_built(cl.Program(context, text), options)
+    except cl.RuntimeError as error:
+        raise build_failure(describe(context.devices[0]), error) from error
+
+
+def _quietly_built(program: cl.Program, options: tuple[str, ...]) -> cl.Program:
+    with ignored_warnings():
+        program.int_ptr  # noqa: B018  makes PyOpenCL build without its own cache, and warn of it
+        return program.build(list(options))

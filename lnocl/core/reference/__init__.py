@@ -1,0 +1,46 @@
+"""The NumPy twin of every kernel, in float64, under the kernel's name.
+
+A twin takes and returns arrays in their natural order, where the kernel has its own layout
+(`lnocl.core.opencl.layout`). Row spectra are half spectra along x alone, shape (..., Ny, Nx // 2 +
+1).
+"""
+
+from lnocl.core.reference.columns import fft_columns, ifft_columns
+from lnocl.core.reference.convolve import convolve_columns, correlate_columns, otf_columns
+from lnocl.core.reference.ratio import ratio_rows
+from lnocl.core.reference.rows import irfft_rows, rfft_rows
+from lnocl.core.reference.scale import scale_rows
+from lnocl.core.reference.smooth import smooth
+from lnocl.core.reference.step import gradient_rows, step_rows
+from lnocl.core.reference.sums import collect_sums
+from lnocl.core.reference.transmit import gather_rows, transmit_rows
+from lnocl.core.reference.turn import (
+    irfft_sheared,
+    ratio_sheared,
+    rfft_sheared,
+    sample_lines,
+    unshear_columns,
+)
+
+__all__ = [
+    "collect_sums",
+    "convolve_columns",
+    "correlate_columns",
+    "fft_columns",
+    "gather_rows",
+    "gradient_rows",
+    "ifft_columns",
+    "irfft_rows",
+    "irfft_sheared",
+    "otf_columns",
+    "ratio_rows",
+    "ratio_sheared",
+    "rfft_rows",
+    "rfft_sheared",
+    "sample_lines",
+    "scale_rows",
+    "smooth",
+    "step_rows",
+    "transmit_rows",
+    "unshear_columns",
+]

@@ -1,0 +1,380 @@
+"""Errors of what is measured in a reconstruction, by replicas of it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from contextlib import closing
+from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from lnocl.core.runs.outcome import Outcome
+from lnocl.core.runs.progress import Progress
+from lnocl.core.runs.quantities import Part, Quantity, in_electrons, measure, quantities_of
+from lnocl.core.runs.replicas import Replicas
+from lnocl.core.scene.apertures import AMOUNT, FLUX, FWHM
+from lnocl.core.scene.arrays import Array, whole
+from lnocl.core.scene.texture import resolution
+from lnocl.errors import InputError
+from lnocl.parallel import Parallel, work
+
+if TYPE_CHECKING:
+    from astropy.table import QTable
+
+MIN_REPLICAS = 10
+# Levels of the intervals.
+LEVELS = 0.68, 0.95
+
+
+@dataclass(frozen=True, eq=False)
+class Bootstrap:
+    r"""Errors of quantities of a reconstruction, by replicas of it.
+
+    A replica is a sky that the reconstruction may stand for (`lnocl.core.scene.texture`), observed
+    and reconstructed alike. Its errors are the values found less the values drawn. Their mean is
+    the bias b, their standard deviation the standard error s. Where the stated errors of stars are
+    larger than replicas tell, s has the rest too, with the share of each star that a region holds.
+    The interval of a level round the value v is
+
+    .. math:: v - b \pm t \, s \sqrt{1 + 1 / n}
+
+    for n replicas, with t the quantile of Student's distribution of n - 1 degrees of freedom.
+
+    Attributes
+    ----------
+    quantities : tuple of k Quantity
+        Fluxes of stars, amounts of halos, positions of stars where these were refined, the light of
+        the extended source in regions, light and widths along profiles.
+    errors : ndarray of float64, shape (n, k)
+        The errors of each replica, in electrons or pixels. Those of the PSFs are included where
+        their scatter is known.
+    of_psfs : ndarray of float64, shape (n, k) or (0, k)
+        The part of the errors that comes from PSFs; of length 0 where their scatter is not known.
+    sums : ndarray of float64, shape (3, ny, nx)
+        The sums over replicas of the errors of the extended source and of their squares, electrons
+        per pixel, smoothed to the resolution; and the number of replicas in which there is light.
+    resolution : float
+        Full width at half maximum of that smoothing, pixels: the resolution of all images together.
+    seed : int
+        Of the replicas.
+    unit : str
+        Of light: ``electron``, or ``electron/s`` where exposures were given.
+    stated : ndarray of float64, shape (n_fluxes,)
+        Standard errors of stars and halos, `lnocl.Result.star_flux_errors` and
+        `lnocl.Result.halo_flux_errors`.
+    shares : ndarray of float64, shape (k, n_fluxes)
+        The share of each star's light that each quantity holds, 1 for its own flux.
+
+    See Also
+    --------
+    lnocl.Result.bootstrap : Returns it.
+
+    References
+    ----------
+    Efron, B., Tibshirani, R. J., "An Introduction to the Bootstrap" (1993), chapter 6.5.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import lnocl
+    >>> y, x = np.indices((33, 33)) - 16
+    >>> psf = np.exp(-(x**2 + y**2) / 4)
+    >>> observation = lnocl.Observation(5 + 1000 * psf / psf.sum(), psf)
+    >>> result = lnocl.deconvolve(observation, [(16, 16)], stop=None, n_iter=5, engine="numpy")
+    >>> found = result.bootstrap(10)
+    >>> found.n, found.unit, found.quantities[0].name, found.values.round()
+    (10, 'electron', 'star 1 flux', array([1000.]))
+    >>> low, high = found.interval(0.95)
+    >>> bool(low[0] < 1000 < high[0])
+    True
+    >>> found.bias.shape, found.standard_errors.shape, found.error_map.shape, found.bias_map.shape
+    ((1,), (1,), (33, 33), (33, 33))
+    """
+
+    quantities: tuple[Quantity, ...]
+    errors: Array
+    of_psfs: Array
+    sums: Array
+    resolution: float
+    seed: int
+    unit: str = "electron"
+    stated: Array = field(default_factory=lambda: np.zeros(0))
+    shares: Array = field(default_factory=lambda: np.zeros((1, 0)))
+
+    @property
+    def n(self) -> int:
+        """Number of replicas."""
+        return len(self.errors)
+
+    @property
+    def values(self) -> Array:
+        """The values in the reconstruction, shape (k,), electrons or pixels."""
+        return np.array([quantity.value for quantity in self.quantities])
+
+    @property
+    def bias(self) -> Array:
+        """The mean errors, shape (k,), electrons or pixels."""
+        return self.errors.mean(axis=0)
+
+    @property
+    def standard_errors(self) -> Array:
+        """The standard errors, shape (k,), electrons or pixels."""
+        variances = self.errors.var(axis=0, ddof=1)
+        hidden = np.maximum(self.stated**2 - variances[: len(self.stated)], 0.0)
+        return np.asarray(np.sqrt(variances + self.shares**2 @ hidden))
+
+    def units(self, electrons: float) -> Array:
+        """Return electrons in the unit of each quantity, 1 for positions, shape (k,)."""
+        return np.array([electrons if each.kind == FLUX else 1.0 for each in self.quantities])
+
+    def interval(self, level: float) -> Array:
+        """Return the bounds that hold the truth with this probability.
+
+        Parameters
+        ----------
+        level : float
+            The probability, in (0, 1).
+
+        Returns
+        -------
+        ndarray of float64, shape (2, k)
+            Lower and upper bounds, electrons or pixels.
+
+        Raises
+        ------
+        InputError
+            The level is not between 0 and 1.
+
+        Examples
+        --------
+        Ten errors of a flux of 100 electrons, without bias:
+
+        >>> import numpy as np
+        >>> from lnocl.core.runs.bootstrap import Bootstrap, Quantity
+        >>> flux, errors = Quantity("star 1 flux", "flux", 100.0), np.tile([[-3.0], [3.0]], (5, 1))
+        >>> found = Bootstrap((flux,), errors, errors[:0], np.zeros((3, 8, 8)), 2.0, seed=0)
+        >>> found.interval(0.68).ravel().round(1)
+        array([ 96.5, 103.5])
+        """
+        from scipy.stats import t
+
+        if not 0.0 < level < 1.0:
+            raise InputError(f"the level of an interval lies between 0 and 1; {level} was given")
+        half = t.ppf((1.0 + level) / 2.0, self.n - 1) * np.sqrt(1.0 + 1.0 / self.n)
+        middle, width = self.values - self.bias, half * self.standard_errors
+        return np.array([middle - width, middle + width])
+
+    @property
+    def shares_there(self) -> Array:
+        """The share of replicas in which light is there, shape (k,); NaN for positions and widths.
+
+        It is there where the value less the error of the replica is above 0.
+        """
+        is_light = np.array([each.kind in (FLUX, AMOUNT) for each in self.quantities])
+        shares = np.mean(self.values - self.errors > 0, axis=0)
+        return np.where(is_light, shares, np.nan)
+
+    @property
+    def share_map(self) -> Array:
+        """The share of replicas in which each pixel has light, at the resolution."""
+        return np.asarray(self.sums[2] / self.n)
+
+    @property
+    def bias_map(self) -> Array:
+        """Mean error of the extended source, electrons per pixel, at the resolution."""
+        return np.asarray(self.sums[0] / self.n)
+
+    @property
+    def error_map(self) -> Array:
+        """Standard error of the extended source, electrons per pixel, at the resolution."""
+        squares = self.sums[1] - self.sums[0] ** 2 / self.n
+        return np.sqrt(np.maximum(squares, 0.0) / (self.n - 1))
+
+    def to_table(self, electrons: float = 1.0, unit: str | None = None) -> QTable:
+        """Return a table with a row for each quantity.
+
+        Parameters
+        ----------
+        electrons : float, optional
+            Electrons in the unit of fluxes.
+        unit : str, optional
+            That unit; by default the attribute ``unit``.
+
+        Returns
+        -------
+        astropy.table.QTable
+            Columns ``name``, ``at`` and ``unit``; ``value``, ``bias`` and ``error``; ``low68``,
+            ``high68``, ``low95`` and ``high95``, the intervals; ``share``, that of replicas with
+            the light; and ``note``. Where the scatter of the PSFs is known, ``error_psf`` is its
+            part of the error, and ``error_noise`` the rest.
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> from lnocl.core.runs.bootstrap import Bootstrap, Quantity
+        >>> flux, errors = Quantity("star 1 flux", "flux", 100.0), np.tile([[-3.0], [3.0]], (5, 1))
+        >>> found = Bootstrap((flux,), errors, errors[:0], np.zeros((3, 8, 8)), 2.0, seed=0)
+        >>> print(found.to_table()["name", "value", "error"][0]["error"].round(2))
+        3.16
+        """
+        from astropy.table import QTable  # which takes its time to load
+
+        columns = {"value": self.values, "bias": self.bias, "error": self.standard_errors}
+        if len(self.of_psfs):
+            columns["error_noise"] = (self.errors - self.of_psfs).std(axis=0, ddof=1)
+            columns["error_psf"] = self.of_psfs.std(axis=0, ddof=1)
+        units = {FLUX: unit or self.unit, AMOUNT: "electron"}
+        for level in LEVELS:
+            low, high = self.interval(level)
+            columns |= {f"low{level * 100:.0f}": low, f"high{level * 100:.0f}": high}
+        return QTable(
+            {
+                "name": [each.name for each in self.quantities],
+                "at": [np.nan if each.at is None else each.at for each in self.quantities],
+                "unit": [units.get(each.kind, "pix") for each in self.quantities],
+                **{name: values / self.units(electrons) for name, values in columns.items()},
+                "share": self.shares_there,
+                "note": [each.note for each in self.quantities],
+            }
+        )
+
+
+def bootstrap(
+    outcome: Outcome,
+    n: int,
+    parts: Sequence[Part],
+    seed: int,
+    progress: bool = False,
+    earlier: Bootstrap | None = None,
+    look: Callable[[Bootstrap], None] | None = None,
+    parallel: Parallel = False,
+) -> Bootstrap:
+    """Return the errors of a reconstruction by n replicas, of which some may be there already.
+
+    Parameters
+    ----------
+    outcome : Outcome
+        The reconstruction.
+    n : int
+        Replicas, `MIN_REPLICAS` or more.
+    parts : sequence of Aperture or Profile
+        What of the extended source is measured.
+    seed : int
+        Zero or more.
+    progress : bool, optional
+        Show a progress bar.
+    earlier : Bootstrap, optional
+        Replicas of the same reconstruction, measured alike; n of them and the others in all.
+    look : callable, optional
+        Is given the errors so far after each replica from the second on.
+    parallel : bool, int or "current-scheduler", optional
+        As for `lnocl.parallel.check_parallel`.
+
+    Raises
+    ------
+    InputError
+        n is less than ten, the seed is negative, or earlier replicas are of another reconstruction.
+    """
+    check_number(n, seed)
+    found = without_replicas(outcome, parts, seed)
+    if earlier is not None:
+        _refuse_other(earlier, found)
+        found = earlier
+    make = partial(_Measuring, outcome, parts, seed, found.resolution)
+    with (
+        Progress(n, "replica", progress, "replicas") as bar,
+        closing(work(make, range(found.n, n), parallel)) as measured,
+    ):
+        bar.update(found.n)
+        for each in measured:
+            found = _with(found, each)
+            bar.update()
+            if look is not None and found.n > 1:
+                look(found)
+    return found
+
+
+def without_replicas(outcome: Outcome, parts: Sequence[Part], seed: int) -> Bootstrap:
+    """Return the quantities of a reconstruction, measured on itself, without replicas."""
+    width = resolution(outcome.scene)
+    quantities, shares = quantities_of(outcome, parts, width)
+    stated = np.nan_to_num(in_electrons(outcome, outcome.star_errors()[0]))
+    pixels = np.zeros((3, *outcome.scene.observation.sky_shape))
+    none = np.zeros((0, len(quantities)))
+    is_rate = (outcome.scene.observation.exposure != 1.0).any()
+    unit = "electron/s" if is_rate else "electron"
+    return Bootstrap(quantities, none, none, pixels, width, seed, unit, stated, shares)
+
+
+def check_number(n: object, seed: object) -> None:
+    """Refuse a number of replicas, or a seed, that is out of range.
+
+    Raises
+    ------
+    InputError
+        n is not a whole number of ten or more, or the seed is not one of zero or more.
+    """
+    whole("bootstrap", n, MIN_REPLICAS, ", such as 50")
+    whole("seed", seed, 0)
+
+
+class _Measured(NamedTuple):
+    """What a replica adds to the arrays of `Bootstrap` of these names."""
+
+    errors: Array
+    of_psfs: Array
+    sums: Array
+
+
+class _Measuring:
+    """Makes a replica by its number, and measures it."""
+
+    def __init__(self, outcome: Outcome, parts: Sequence[Part], seed: int, width: float) -> None:
+        self._outcome, self._parts, self._width = outcome, parts, width
+        self._replicas = Replicas(outcome, seed)
+        self._smooth_answer = self._smooth(outcome.estimate.observed_sky)
+
+    def _smooth(self, sky: Array) -> Array:
+        """Return a sky at the resolution."""
+        from scipy.ndimage import gaussian_filter
+
+        return np.asarray(gaussian_filter(sky, self._width / FWHM, mode="nearest"))
+
+    def __call__(self, k: int) -> _Measured:
+        replica = self._replicas.reconstruct(k)
+        drawn, seen = (measure(self._outcome, sky, self._parts) for sky in replica[:2])
+        last, of_psfs = replica.found, np.zeros((0, len(seen)))
+        if replica.found_with_psfs is not None:
+            last = replica.found_with_psfs
+            of_psfs = (measure(self._outcome, last, self._parts) - seen)[None]
+            seen = seen + of_psfs[0]
+        smooth = self._smooth(last.extended - replica.drawn.extended)
+        # There is light where the answer is brighter than the error.
+        sums = np.array([smooth, smooth**2, self._smooth_answer > smooth])
+        return _Measured((seen - drawn)[None], of_psfs, sums)
+
+
+def _with(found: Bootstrap, measured: _Measured) -> Bootstrap:
+    """Return the errors with those of one replica more."""
+    return replace(
+        found,
+        errors=np.concatenate([found.errors, measured.errors]),
+        of_psfs=np.concatenate([found.of_psfs, measured.of_psfs]),
+        sums=found.sums + measured.sums,
+    )
+
+
+def _refuse_other(earlier: Bootstrap, expected: Bootstrap) -> None:
+    """Refuse replicas of another reconstruction, or that were measured otherwise."""
+    is_same = (
+        earlier.quantities == expected.quantities
+        and earlier.sums.shape == expected.sums.shape
+        and (earlier.seed, earlier.resolution) == (expected.seed, expected.resolution)
+    )
+    if not is_same:
+        raise InputError(
+            "the replicas that are there are of another reconstruction, other regions or another "
+            "seed: give those, or begin anew"
+        )

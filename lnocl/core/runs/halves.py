@@ -1,0 +1,193 @@
+"""Reconstructions of two halves of the counts, in step, and the snapshots that are held of them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lnocl.core.runs.run import Run
+from lnocl.core.runs.start import Start
+from lnocl.core.scene.arrays import Array
+from lnocl.core.solvers.engine import State
+from lnocl.errors import DivergedError, NotFiniteError, warn
+
+# The ratio of one iteration of which a snapshot is taken to that before.
+SPACING = 1.1
+
+# The beginnings of the names under which the state of each half, a number, and snapshots are saved.
+HALVES, SNAPSHOTS = "halves_", "snapshots"
+
+
+class Snapshot(NamedTuple):
+    """The estimates of both halves at an iteration, scaled: their mean is that of all counts.
+
+    Attributes
+    ----------
+    iteration : int
+        The iteration.
+    extended : ndarray, shape (2, Ny, Nx)
+        A and B, the extended sources.
+    star_fluxes : ndarray of float64, shape (2, n)
+        Star fluxes.
+    positions : ndarray of float64, shape (2, n, 2)
+        Star positions.
+    """
+
+    iteration: int
+    extended: Array
+    star_fluxes: Array
+    positions: Array
+
+
+class Halves:
+    """Runs on two halves of the counts; iterating over them runs both, and takes snapshots.
+
+    Parameters
+    ----------
+    starts : sequence of two Start
+        Where they start.
+    n_iter : int
+        The last iteration, at most.
+    first : int
+        The iteration that they start from.
+
+    Attributes
+    ----------
+    first : int
+        The iteration that they start from.
+    done : int
+        The last iteration that both have done.
+    snapshots : list of Snapshot
+        At iterations a tenth apart.
+    """
+
+    def __init__(self, starts: Sequence[Start], n_iter: int, first: int = 0) -> None:
+        self._start, self._n_iter = starts[0], n_iter
+        self._runs = [Run(start, n_iter - first, half) for half, start in enumerate(starts)]
+        self.first = self.done = first
+        self.snapshots: list[Snapshot] = []
+
+    def __iter__(self) -> Iterator[int]:
+        """Iterate; where the objective of a half rises, end at the last snapshot before that.
+
+        Raises
+        ------
+        DivergedError, NotFiniteError
+            An objective rises or is not finite, and no snapshot before that is left.
+
+        Warns
+        -----
+        LnoclWarning
+            An objective rises or is not finite.
+        """
+        due = self._due()
+        try:
+            for done, _ in zip(*self._runs, strict=False):
+                self.done = self.first + done
+                if self.done == due:
+                    self.snapshots.append(self.snapshot())
+                    due = self._due()
+                yield self.done
+        except (DivergedError, NotFiniteError):
+            best = self.first + min(run.best_iteration() for run in self._runs)
+            self.snapshots = [each for each in self.snapshots if each.iteration <= best]
+            if not self.snapshots:
+                raise
+            warn(
+                f"the objective of a half of the counts rises after iteration {best}: held-out "
+                f"counts choose among the iterations up to {self.snapshots[-1].iteration}"
+            )
+
+    def _due(self) -> int:
+        """Return the iteration of the next snapshot."""
+        return next_snapshot(self.snapshots[-1].iteration if self.snapshots else self.first)
+
+    def snapshot(self) -> Snapshot:
+        """Return the estimates as they are."""
+        extended = np.empty((2, *self._runs[0].scene.grid), _dtype(self._start))
+        for half, run in zip(extended, self._runs, strict=True):
+            half[:] = run.engine.extended()
+        return Snapshot(
+            self.done,
+            extended,
+            np.array([run.engine.star_fluxes() for run in self._runs]),
+            np.array([run.scene.stars for run in self._runs]),
+        )
+
+    def extended(self) -> Array:
+        """Return the sum of the extended sources, electrons per pixel, shape (ny, nx)."""
+        first, second = self._runs
+        return first.extended() + second.extended()
+
+    def star_fluxes(self) -> Array:
+        """Return the sums of the star fluxes, electrons."""
+        first, second = self._runs
+        return first.star_fluxes() + second.star_fluxes()
+
+    def is_shown(self) -> NDArray[np.bool_]:
+        """Return which stars, and halos, any image shows."""
+        return self._runs[0].scene.is_shown
+
+    def star_positions(self) -> Array:
+        """Return the means of the star positions, pixels, shape (n, 2)."""
+        return np.mean([run.star_positions() for run in self._runs], axis=0)
+
+    def objective(self) -> float:
+        """Return the sum of the last objectives."""
+        return sum(run.objective() for run in self._runs)
+
+    def objectives(self, last: int) -> Array:
+        """Return the sums of the objectives, of where they started and all iterations up to one."""
+        for run in self._runs:
+            run.finish()
+        first, second = (run.objectives()[: last - self.first + 1] for run in self._runs)
+        return first + second
+
+    def state(self) -> State:
+        """Return the arrays that `restore` needs, as they are between iterations.
+
+        Raises
+        ------
+        NotFiniteError
+            A value is infinite or not a number.
+        """
+        state = pack(SNAPSHOTS, self.snapshots)
+        for k, run in enumerate(self._runs):
+            state |= {f"{HALVES}{k}_{name}": array for name, array in run.state().items()}
+        return state
+
+    def restore(self, state: State) -> None:
+        """Continue from this state."""
+        for k, run in enumerate(self._runs):
+            prefix = f"{HALVES}{k}_"
+            own = {name for name in state if name.startswith(prefix)}
+            run.restore({name.removeprefix(prefix): state[name] for name in own})
+        self.snapshots = unpack(SNAPSHOTS, state)
+        self.done = self.first + self._runs[0].done
+
+
+def pack(name: str, snapshots: Sequence[Snapshot]) -> State:
+    """Return the arrays of snapshots, by the names under which they are saved."""
+    columns = zip(Snapshot._fields, zip(*snapshots, strict=True), strict=False)
+    return {f"{name}_{field}": np.array(values) for field, values in columns}
+
+
+def unpack(name: str, state: State) -> list[Snapshot]:
+    """Return the snapshots that are saved under a name."""
+    iterations, *others = (state.get(f"{name}_{field}", ()) for field in Snapshot._fields)
+    return list(map(Snapshot, map(int, iterations), *others))
+
+
+def _dtype(start: Start) -> np.dtype:
+    """Return the type of the extended sources: that of the device."""
+    is_single = start.setup.engine == "opencl" and start.setup.precision == "single"
+    return np.dtype(np.float32 if is_single else np.float64)
+
+
+def next_snapshot(iteration: int) -> int:
+    """Return the iteration of which a snapshot is taken after that of another."""
+    return max(iteration + 1, math.floor(SPACING * iteration))

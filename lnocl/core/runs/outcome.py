@@ -1,0 +1,331 @@
+"""The outcome of a reconstruction: its estimate, and how that was reached."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lnocl.core.runs.start import Setup
+from lnocl.core.scene.arrays import Array
+from lnocl.core.scene.estimate import Estimate
+from lnocl.core.scene.observation import Observation
+from lnocl.core.scene.scene import Scene
+from lnocl.core.scene.stars import MAX_SHIFT
+from lnocl.errors import warn
+from lnocl.residuals import StarResiduals, judge_stars
+
+if TYPE_CHECKING:
+    from lnocl.core.solvers.levels import Levels
+    from lnocl.core.solvers.light import Light
+
+CURVE_DTYPE = np.dtype([("smoothing", np.float64), ("iteration", np.int64), ("error", np.float64)])
+
+
+@dataclass(frozen=True)
+class PsfRefinement:
+    """The outcome for PSFs that do not fit, were to be refined, or whose scatter was given.
+
+    Attributes
+    ----------
+    parameters : tuple of str
+        Names of the n parameters of each PSF (`lnocl.core.scene.psf_families.PsfFamilies`).
+    values : ndarray of float64, shape (p, n)
+        Their values in the PSFs used; lengths in pixels of the images. Where the refined PSFs were
+        not accepted, those that were found for them.
+    misfit : tuple of float
+        The reduced chi squared at the stars (`lnocl.core.scene.psf_misfit`), of the given PSFs and
+        of those used: 1 for noise alone.
+    is_accepted : bool
+        Whether the refined PSFs are used (`lnocl.core.runs.psf_refinement.mend`).
+    psf_error : float
+        Relative error that the PSFs used still have at the stars, or as given by ``psf_scatter``; 0
+        where it is not told from noise. Where pixels were fitted it is the error before that.
+    edges : ndarray of float64, shape (k + 1,)
+        Radii of rings round a star, pixels.
+    errors_in_rings : ndarray of float64, shape (k,)
+        The same error in each ring.
+    may_be_faked : ndarray of float64, of the shape of the extended source
+        Light that this error may fake in the sky, electrons per pixel. In each ring it is the error
+        times the light of the stars, as the PSFs spread it, over the square root of p.
+    has_free_pixels : bool
+        Whether the PSFs used were fitted pixel by pixel, and so follow the noise too.
+    hidden_error : float
+        Relative error that refined PSFs or places may have though noise hides it; it is in the
+        errors of star fluxes.
+
+    See Also
+    --------
+    lnocl.deconvolve : Refines PSFs with ``refine_psfs``.
+
+    Examples
+    --------
+    One image of a star, whose PSF is known to 1 % in each pixel:
+
+    >>> import numpy as np
+    >>> import lnocl
+    >>> y, x = np.indices((33, 33)) - 16
+    >>> psf = np.exp(-(x**2 + y**2) / 4)
+    >>> psf /= psf.sum()
+    >>> observation = lnocl.Observation(5 + 1000 * psf, psf, psf_scatter=0.01 * psf)
+    >>> result = lnocl.deconvolve(observation, [(16, 16)], stop=None, n_iter=5, engine="numpy")
+    >>> result.psf_refinement.is_accepted
+    False
+    >>> round(result.psf_refinement.psf_error, 4)
+    0.01
+    """
+
+    parameters: tuple[str, ...]
+    values: Array
+    misfit: tuple[float, float]
+    is_accepted: bool
+    psf_error: float
+    edges: Array
+    errors_in_rings: Array
+    may_be_faked: Array
+    has_free_pixels: bool = False
+    hidden_error: float = 0.0
+
+
+class Mended(NamedTuple):
+    """A setup whose PSFs and positions fit as well as could be found.
+
+    Attributes
+    ----------
+    setup : Setup
+        With the refined PSFs, where they are used, the scatter that they have left, and whether
+        stars are to be moved.
+    refinement : PsfRefinement or None
+        The outcome for the PSFs; None where they fit, and nothing was asked of them.
+    near_stars : ndarray of float64, of the shape of the extended source, or None
+        The weight of the edge-preserving term that the error of the PSFs asks for; None for 0.
+    fits : bool
+        Whether the PSFs were judged, and no error is left that noise does not explain.
+    """
+
+    setup: Setup
+    refinement: PsfRefinement | None = None
+    near_stars: Array | None = None
+    fits: bool = False
+
+
+def mean_over_epochs(fluxes: Array, n_epochs: int) -> Array:
+    """Return the mean flux of each star, star by star in each epoch, over those that are known."""
+    of_epochs = fluxes.reshape(-1, n_epochs)
+    is_known = np.isfinite(of_epochs)
+    n_known = is_known.sum(axis=1)
+    totals = np.where(is_known, of_epochs, 0.0).sum(axis=1)
+    return np.divide(totals, n_known, out=np.full(len(totals), np.nan), where=n_known > 0)
+
+
+def marginalise(estimate: Estimate, stars: bool, halos: bool, levels: bool) -> Estimate:
+    """Return the estimate with levels, halos and stars marginal where wanted.
+
+    `lnocl.core.solvers.levels`, `lnocl.core.solvers.halos` and `lnocl.core.solvers.marginal` have
+    the equations.
+    """
+    if levels:
+        from lnocl.core.solvers.levels import fit_levels
+
+        estimate = fit_levels(estimate)
+    if halos:
+        from lnocl.core.solvers.halos import marginal_halos
+
+        estimate = marginal_halos(estimate)
+    if stars:
+        from lnocl.core.solvers.marginal import marginal
+
+        estimate = marginal(estimate)
+    return estimate
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """The estimate that a reconstruction ended with, and how it came there.
+
+    Attributes
+    ----------
+    setup : Setup
+        Observation and parameters, from which it starts anew.
+    estimate : Estimate
+        What it has found, with the stars where they are now.
+    objectives : ndarray of float64, shape (n_iter + 1,)
+        Objectives of the start and after each iteration; not scaled.
+    stop_reason : str
+        As `lnocl.Result.stop_reason`.
+    curve : ndarray of `CURVE_DTYPE`
+        As `lnocl.Result.held_out`.
+    psf_refinement : PsfRefinement or None
+        None where the PSFs were not to be refined.
+    is_marginal : bool
+        Whether the star fluxes are those of `marginal`, and so those of replicas.
+    has_marginal_halos : bool
+        Whether the amounts of halos are, likewise.
+    may_free_pixels : bool
+        Whether the pixels of PSFs were not to be refined, and could be.
+    plan : tuple of str
+        That of the run (`lnocl.core.runs.plan.Plan`), a line for each step.
+    has_levels : bool
+        Whether levels of the background were fitted.
+    """
+
+    setup: Setup
+    estimate: Estimate
+    objectives: Array
+    stop_reason: str
+    curve: NDArray[np.void] = field(default_factory=lambda: np.zeros(0, CURVE_DTYPE))
+    psf_refinement: PsfRefinement | None = None
+    is_marginal: bool = False
+    has_marginal_halos: bool = False
+    has_levels: bool = False
+    may_free_pixels: bool = False
+    plan: tuple[str, ...] = ()
+
+    @property
+    def scene(self) -> Scene:
+        """The model of the observation."""
+        return self.estimate.scene
+
+    @property
+    def sky(self) -> Array:
+        """Extended source on the grid, electrons per pixel, shape (Ny, Nx)."""
+        return self.estimate.sky
+
+    @property
+    def star_fluxes(self) -> Array:
+        """Fluxes of the stars and then of the halos, electrons, shape (n_fluxes,)."""
+        return self.estimate.star_fluxes
+
+    @property
+    def given_positions(self) -> Array:
+        """The places of the stars that were given, in the order of the fluxes, shape (n, 2)."""
+        return np.repeat(self.setup.stars, self.observation.n_epochs, axis=0)
+
+    @property
+    def fluxes_of_stars(self) -> Array:
+        """Electrons, shape (n,); NaN where no image shows a star in its epoch."""
+        n = self.scene.n_stars
+        return np.where(self.scene.is_shown[:n], self.star_fluxes[:n], np.nan)
+
+    @property
+    def mean_fluxes(self) -> Array:
+        """The mean of each star over the epochs that show it, electrons; NaN where none does."""
+        return mean_over_epochs(self.fluxes_of_stars, self.observation.n_epochs)
+
+    @property
+    def moves(self) -> bool:
+        """Whether stars were moved."""
+        return self.setup.refine_positions and self.scene.n_stars > 0
+
+    def marginal(self, stars: bool, halos: bool, levels: bool) -> Outcome:
+        """Return the outcome with marginal star fluxes, amounts of halos, or levels fitted."""
+        estimate = marginalise(self.estimate, stars, halos, levels)
+        return replace(
+            self,
+            setup=replace(self.setup, observation=estimate.scene.observation),
+            estimate=estimate,
+            is_marginal=stars,
+            has_marginal_halos=halos,
+            has_levels=levels,
+        )
+
+    def of_halos(self, fluxes: Array) -> Array:
+        """Return those of fluxes that are of halos, electrons of each image, shape (n_halos, p)."""
+        of_halos = fluxes[self.scene.n_stars :] * self.scene.mean_exposure
+        return of_halos.reshape(-1, self.scene.n_images)
+
+    @property
+    def observation(self) -> Observation:
+        """The observation, with the PSFs that were used."""
+        return self.scene.observation
+
+    def models(self) -> Iterator[Array]:
+        """Yield the m_j, electrons per pixel."""
+        ny, nx = self.observation.shape
+        for j, image in enumerate(self.estimate.models()):
+            yield self.scene.in_electrons(image, j)[:ny, :nx]
+
+    def star_residuals(self) -> list[StarResiduals]:
+        """Return how well the model fits at each star."""
+        return judge_stars(self.estimate)
+
+    def extended_flux(self, star_flux_errors: Array) -> tuple[float, float]:
+        """Return the light of the extended source and its standard error, electrons."""
+        whole = np.broadcast_to(1.0, self.observation.sky_shape)
+        return self.light().flux(whole, star_flux_errors)
+
+    def light(self) -> Light:
+        """Return the light of the extended source without bias."""
+        from lnocl.core.solvers.light import Light  # which loads scipy
+
+        return Light(self.estimate, self.levels)
+
+    @cached_property
+    def levels(self) -> Levels | None:
+        """The levels of the background, where they are not known."""
+        if not self.scene.observation.background_error.any():
+            return None
+        from lnocl.core.solvers.levels import Levels  # which loads scipy
+
+        return Levels(self.estimate, self.has_levels)
+
+    def levels_in_words(self) -> list[str]:
+        """Return the level of each image whose background was fitted, electrons per pixel."""
+        if self.levels is None or not self.has_levels:
+            return []
+        observation = self.scene.observation
+        pairs = zip(observation.background, observation.read_noise, strict=True)
+        levels = [float(np.mean(level) - np.mean(noise**2)) for level, noise in pairs]
+        return [
+            f"`images[{j}]`: background {levels[j]:.6g} +- {error:.2g} electrons per pixel, fitted "
+            "with the rest"
+            for j, error in enumerate(self.levels.errors[:, 0])
+            if error > 0
+        ]
+
+    def star_errors(self) -> tuple[Array, Array]:
+        """Return the standard errors of fluxes and positions, the extended source not known.
+
+        Fluxes are those of stars and halos. `lnocl.core.solvers.star_errors` has the equation. The
+        relative error that the PSFs still have is that of each star's flux too, added in
+        quadrature. NaN for positions that were not fitted, and where the images do not determine
+        them.
+
+        Warns
+        -----
+        LnoclWarning
+            The images do not determine flux and position of a star, or the amount of a halo.
+        """
+        from lnocl.core.solvers.halos import halo_errors
+        from lnocl.core.solvers.star_errors import standard_errors
+
+        scene, moves = self.scene, self.moves
+        star_fluxes = self.star_fluxes[: scene.n_stars]
+        halos = halo_errors(self.estimate)
+        errors = standard_errors(self.estimate, moves, halos.raised, self.levels)
+        is_lost = np.isnan(errors[:, : 3 if moves else 1]).any(axis=1) & (star_fluxes > 0)
+        _warn_of_undetermined(scene.stars[is_lost], bool(np.isnan(halos.errors).any()))
+        if self.psf_refinement is not None:
+            refinement = self.psf_refinement
+            of_psfs = np.hypot(refinement.psf_error, refinement.hidden_error)
+            errors[:, 0] = np.hypot(errors[:, 0], of_psfs * star_fluxes)
+        positions = errors[:, 1:]
+        positions[positions > MAX_SHIFT] = np.nan  # no star is moved farther
+        return np.append(errors[:, 0], halos.errors), positions
+
+
+def _warn_of_undetermined(stars: Array, are_halos: bool) -> None:
+    """Warn of stars, and perhaps halos, that the images do not tell from others."""
+    named = ", ".join(f"({x:.7g}, {y:.7g})" for x, y in stars)
+    lost = [f"flux and position of each star at {named}"] * bool(named)
+    lost += ["the amounts of all halos"] * are_halos
+    advice = "leave out stars that lie on others"
+    if are_halos:
+        advice = "leave out halos that others, or a star, can stand in for"
+    if lost:
+        words = " and ".join(lost)
+        warn(f"the images do not determine {words}, so that these errors are NaN; {advice}")

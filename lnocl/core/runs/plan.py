@@ -1,0 +1,245 @@
+"""A plan: what `lnocl.deconvolve` does with an observation, by one table of rules."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
+from typing import Any, Literal, NamedTuple
+
+from lnocl.core.runs.options import (
+    EngineName,
+    Precision,
+    StopName,
+    check_choices,
+    check_families,
+    check_length,
+    check_observation,
+    read_refine_positions,
+    read_smoothing,
+    read_start,
+)
+from lnocl.core.runs.start import Setup
+from lnocl.core.scene.observation import Observation
+from lnocl.core.scene.penalty import Penalty
+from lnocl.core.scene.psf_families import Family
+from lnocl.core.scene.star_psfs import owned, refuse_unowned
+from lnocl.core.scene.stars import check_positions
+from lnocl.core.solvers import SolverName
+
+LEVELS, PSFS, HALOS, PRIOR, CHOICE, STARS = STEPS = (
+    "fit levels of backgrounds",
+    "judge PSFs before the run",
+    "settle halos",
+    "give stars a prior by a run with a fixed weight",
+    "choose the iteration by held-out counts",
+    "take marginal star fluxes",
+)
+
+
+class Condition(NamedTuple):
+    """What must hold of a plan for a step.
+
+    Attributes
+    ----------
+    holds : callable
+        Tells of the plan whether it does.
+    otherwise : str
+        What is said where it does not.
+    """
+
+    holds: Callable[[Plan], bool]
+    otherwise: str
+
+
+AUTO = Condition(lambda plan: plan.smoothing == "auto", "`smoothing` is a number")
+HAS_STARS = Condition(lambda plan: len(plan.setup.stars) > 0, "there are no stars")
+SHOWS_PSFS = Condition(
+    lambda plan: bool((owned(plan.setup.observation, plan.setup.stars) < 0).any()),
+    "all stars have PSFs of their own",
+)
+HAS_HALOS = Condition(lambda plan: len(plan.setup.observation.halos) > 0, "there are no halos")
+HAS_ERROR = Condition(
+    lambda plan: bool(plan.setup.observation.background_error.any()), "backgrounds have no error"
+)
+HELD_OUT = Condition(lambda plan: plan.stop == "held-out", "`stop` is another rule")
+WHOLE = Condition(lambda plan: not plan.in_tiles, "the images are divided into tiles")
+
+# What each step needs, in the order in which reasons are given.
+NEEDS: dict[str, tuple[Condition, ...]] = {
+    LEVELS: (AUTO, HAS_ERROR, WHOLE),
+    PSFS: (AUTO, HAS_STARS, SHOWS_PSFS),
+    HALOS: (AUTO, HAS_HALOS),
+    PRIOR: (AUTO, HELD_OUT, HAS_STARS),
+    CHOICE: (HELD_OUT,),
+    STARS: (AUTO, HAS_STARS),
+}
+# Of steps that hang on what those before find: where they are done.
+UNLESS_WRONG = "unless PSFs are wrong"
+WHERE = {PRIOR: UNLESS_WRONG, CHOICE: UNLESS_WRONG, STARS: "where PSFs fit"}
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """What `lnocl.deconvolve` does with an observation: which steps, and why not the others.
+
+    ``print(plan)`` tells a line of each step. A step that hangs on what others find says so.
+
+    Attributes
+    ----------
+    setup : Setup
+        The observation, the stars and how iterations are computed.
+    mu : float
+        Weight of the Tikhonov term.
+    smoothing : float or "auto"
+        Weight of the edge-preserving term.
+    n_iter : int
+        Iterations at most.
+    stop : {"held-out", "discrepancy"}, float or None
+        Rule by which to stop.
+    families : tuple of str
+        Families of PSFs that may be refined.
+    is_asked : bool
+        Whether they were named.
+    moves : bool or "auto"
+        Whether stars are moved; "auto": where that mends a misfit.
+    in_tiles : bool
+        Whether it is that of `lnocl.deconvolve_tiles`.
+
+    See Also
+    --------
+    lnocl.plan : Makes it.
+    lnocl.deconvolve : Carries it out.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import lnocl
+    >>> image = np.full((16, 16), 2.0)
+    >>> image[5, 8] += 100.0
+    >>> obs = lnocl.Observation(np.stack([image] * 2), np.ones((3, 3)), epochs=[0, 1])
+    >>> print(lnocl.plan(obs, [(8, 5)]))
+    fit levels of backgrounds: no, backgrounds have no error
+    judge PSFs before the run: yes, and fit shift, jitter, pixels
+    settle halos: no, there are no halos
+    give stars a prior by a run with a fixed weight: yes, unless PSFs are wrong
+    choose the iteration by held-out counts: yes, unless PSFs are wrong
+    take marginal star fluxes: yes, where PSFs fit
+    """
+
+    setup: Setup
+    mu: float
+    smoothing: float | Literal["auto"]
+    n_iter: int
+    stop: StopName | float | None
+    families: tuple[str, ...] = ()
+    is_asked: bool = False
+    moves: bool | Literal["auto"] = False
+    in_tiles: bool = False
+
+    @property
+    def judges_psfs(self) -> bool:
+        """Whether PSFs are judged before the run, of itself or as it was asked for."""
+        is_given = len(self.setup.observation.psf_scatter) > 0
+        return self.does(PSFS) or bool(self.families) or is_given
+
+    def why_not(self, step: str) -> str:
+        """Return why a step of `STEPS` is not done; nothing where it is."""
+        return next((each.otherwise for each in NEEDS[step] if not each.holds(self)), "")
+
+    def does(self, step: str) -> bool:
+        """Return whether a step of `STEPS` is done."""
+        return not self.why_not(step)
+
+    def steps(self) -> list[tuple[str, str]]:
+        """Return each step, and in words whether it is done."""
+        return [(step, self._in_words(step)) for step in STEPS]
+
+    def _in_words(self, step: str) -> str:
+        if step == PSFS and self.judges_psfs:
+            return f"yes, and fit {', '.join(self.families)}" if self.families else "yes"
+        if why := self.why_not(step):
+            return f"no, {why}"
+        where = WHERE.get(step, "")
+        if where == UNLESS_WRONG and not self.does(PSFS):
+            where = ""
+        return ", ".join(filter(None, ("yes", where)))
+
+    def __str__(self) -> str:
+        """Return a line for each step."""
+        return "\n".join(f"{step}: {words}" for step, words in self.steps())
+
+
+def plan(
+    observation: Observation,
+    stars: Any = (),
+    *,
+    mu: float = 0.0,
+    smoothing: float | Literal["auto"] = "auto",
+    solver: SolverName = "sgp",
+    n_iter: int = 1000,
+    stop: StopName | float | None = "held-out",
+    precision: Precision = "single",
+    engine: EngineName = "opencl",
+    device: str | None = None,
+    pad: int | Literal["auto"] = "auto",
+    initial_extended: Any = None,
+    initial_star_fluxes: Any = None,
+    refine_positions: bool | Literal["auto"] = "auto",
+    refine_psfs: Literal["auto"] | Iterable[Family] = "auto",
+) -> Plan:
+    """Return what `lnocl.deconvolve` does with an observation; nothing is computed yet.
+
+    Parameters
+    ----------
+    observation, stars
+        As for `lnocl.deconvolve`.
+    mu, smoothing, solver, n_iter, stop, precision, engine, device, pad, initial_extended, \
+    initial_star_fluxes, refine_positions, refine_psfs
+        As for `lnocl.deconvolve`.
+
+    Returns
+    -------
+    Plan
+        Printed, a line for each step.
+
+    Raises
+    ------
+    InputError
+        Images, stars or a parameter cannot be used, as of `lnocl.deconvolve`.
+
+    See Also
+    --------
+    lnocl.deconvolve : Carries it out.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import lnocl
+    >>> obs = lnocl.Observation(np.full((16, 16), 9.0), np.ones((3, 3)))
+    >>> lnocl.plan(obs).why_not("judge PSFs before the run")
+    'there are no stars'
+    """
+    check_observation(observation)
+    check_choices(solver, precision, engine, device)
+    check_length(n_iter, stop)
+    refine_positions = read_refine_positions(refine_positions)
+    fits_stars = solver == "sgp" or refine_positions is True
+    positions = check_positions(stars, observation)
+    refuse_unowned(observation, positions)
+    observation = observation.upright()
+    initial = read_start(observation, fits_stars, initial_extended, initial_star_fluxes)
+    smoothing = read_smoothing(smoothing)
+    Penalty(mu, 0.0 if isinstance(smoothing, str) else smoothing)  # refuses what is out of range
+    setup = Setup(observation, positions, pad, solver, precision, engine, device, False, *initial)
+    made = Plan(setup, mu, smoothing, int(n_iter), stop)
+    is_auto = made.does(PSFS)
+    showing = positions[owned(observation, positions) < 0]
+    families = check_families(refine_psfs, observation, showing, refine_positions, is_auto)
+    moves = refine_positions if is_auto else refine_positions is True
+    return replace(
+        made,
+        setup=replace(setup, refine_positions=moves is True, settles_halos=made.does(HALOS)),
+        families=families,
+        is_asked=bool(families) and not isinstance(refine_psfs, str),
+        moves=moves,
+    )

@@ -1,0 +1,119 @@
+"""What a run takes of its plan, once levels are fitted and PSFs judged."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from lnocl.core.runs.options import StopName
+from lnocl.core.runs.outcome import Mended, PsfRefinement
+from lnocl.core.runs.plan import LEVELS, PSFS, Plan
+from lnocl.core.runs.progress import Progress
+from lnocl.core.runs.start import Setup
+from lnocl.core.runs.steady import STEADY, steady_penalty
+from lnocl.core.scene.arrays import Array
+from lnocl.core.scene.observation import Observation
+from lnocl.core.scene.penalty import Penalty, recommend_smoothing
+from lnocl.errors import NotFiniteError, note
+
+# Of the smoothing that is recommended, from which held-out counts choose besides none.
+MULTIPLES = (1.0, 3.0, 10.0)
+# Runs with wrong PSFs end where the objective falls by less than this share of itself.
+CONVERGED = 1e-6
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """A run that is ready to begin.
+
+    Attributes
+    ----------
+    setup : Setup
+        The parameters, with the observation as it was mended.
+    penalties : sequence of Penalty
+        One, or more from which held-out counts choose.
+    n_iter : int
+        Iterations at most.
+    stop : {"held-out", "discrepancy"}, float or None
+        Rule by which to stop.
+    steady : Penalty or None
+        That of `lnocl.core.runs.steady`, where such a run goes first.
+    refinement : PsfRefinement or None
+        The outcome for PSFs that were judged.
+    fits : bool
+        Whether PSFs were judged, and fit.
+    """
+
+    setup: Setup
+    penalties: Sequence[Penalty]
+    n_iter: int
+    stop: StopName | float | None
+    steady: Penalty | None = None
+    refinement: PsfRefinement | None = None
+    fits: bool = False
+
+    def of(self, observation: Observation, stars: Array, **changes: Any) -> Prepared:
+        """Return this run of another observation, with other stars; `changes` are of the setup."""
+        setup = replace(self.setup, observation=observation, stars=stars, **changes)
+        return replace(self, setup=setup)
+
+    def penalised(self, **changes: Any) -> Prepared:
+        """Return this run with the same changes of all its penalties."""
+        penalties = [replace(each, **changes) for each in self.penalties]
+        steady = self.steady and replace(self.steady, **changes)
+        return replace(self, penalties=penalties, steady=steady)
+
+
+def quietly() -> np.errstate:
+    """Have NumPy not warn of what is too large: the run looks for objectives that are infinite."""
+    return np.errstate(over="ignore", invalid="ignore")
+
+
+def prepare(plan: Plan, progress: bool = False) -> Prepared:
+    """Return the run of a plan, after levels are fitted and PSFs and positions judged."""
+    setup = plan.setup
+    if plan.does(LEVELS):
+        from lnocl.core.runs.halos import settle_levels  # which loads scipy
+
+        with quietly(), Progress(None, "", bool(progress), "fitting levels", stays=False):
+            setup = settle_levels(setup)
+    mended = _judge_psfs(plan, setup, progress) if plan.judges_psfs else Mended(setup)
+    is_auto, stop = plan.does(PSFS), plan.stop
+    are_wrong = is_auto and mended.near_stars is not None and not mended.fits
+    penalties = _penalties(plan, mended, are_wrong)
+    if are_wrong and stop == "held-out":  # which shares their error, and chooses too little
+        stop = CONVERGED
+    steady, fits = steady_penalty(penalties), is_auto and mended.fits
+    return Prepared(mended.setup, penalties, plan.n_iter, stop, steady, mended.refinement, fits)
+
+
+def _judge_psfs(plan: Plan, setup: Setup, progress: bool) -> Mended:
+    """Return that of `lnocl.core.runs.psf_refinement.mend`, or `setup` where it is not finite."""
+    from lnocl.core.runs.psf_refinement import mend  # which loads scipy
+
+    judging = Progress(None, "it", bool(progress), "judging the PSFs", stays=False)
+    with judging, suppress(NotFiniteError):  # of which the run itself tells
+        return mend(setup, plan.families, plan.moves, plan.is_asked, judging.update)
+    return Mended(setup)
+
+
+def _penalties(plan: Plan, mended: Mended, are_psfs_wrong: bool) -> list[Penalty]:
+    """Return the penalty, or those from which held-out counts choose."""
+    if not isinstance(plan.smoothing, str):
+        return [Penalty(plan.mu, plan.smoothing)]
+    recommended = recommend_smoothing(mended.setup.observation)
+    multiples: Sequence[float] = (1.0,)
+    reason = "the noise of the counts"
+    if are_psfs_wrong:
+        multiples, reason = (STEADY,), "the error of the PSFs"
+    elif plan.stop == "held-out":
+        multiples, reason = (0.0, *MULTIPLES), ""
+    weights = (each * recommended for each in multiples)
+    penalties = [Penalty(plan.mu, each, near_stars=mended.near_stars) for each in weights]
+    if reason:
+        note(f"`smoothing` chosen: {penalties[0].in_words()}, by {reason}")
+    return penalties

@@ -1,0 +1,337 @@
+"""PSFs and positions that the images show to be wrong: mended where that helps, else allowed for.
+
+All is judged by one number, the error kappa of the PSFs that is left at the stars in
+`lnocl.core.runs.guarded_runs`: whether anything is wrong, whether a mend is taken, and how strongly
+the extended source is smoothed near the stars because of what could not be mended.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from lnocl.core.runs.guarded_runs import (
+    FIRST_ERROR,
+    GUARD,
+    GuardedRuns,
+    Judged,
+    estimate_scatter,
+)
+from lnocl.core.runs.outcome import Mended, PsfRefinement
+from lnocl.core.runs.psf_allowance import STRENGTH, Allowance
+from lnocl.core.runs.start import Setup
+from lnocl.core.scene.arrays import Array
+from lnocl.core.scene.psf_families import PsfFamilies, PsfParameters
+from lnocl.core.scene.psf_field import Psfs, mapped
+from lnocl.core.scene.psf_misfit import PsfMisfit
+from lnocl.core.scene.psf_wings import without_noise
+from lnocl.core.solvers.psf_fit import step
+from lnocl.errors import counted, note, warn
+
+# A mend is taken where it leaves less than this share of kappa, or nothing to doubt, and a misfit
+# that is less by so many of its standard deviations.
+MENDED, GONE = 0.5, 2.0
+# None is taken that leaves a star less than this share of its flux, or so little to judge by.
+FADED = 0.5
+# Wings without noise are to leave less than this share.
+CLEANED = 0.99
+# Free pixels, which may fit anything, are to leave less than this share of kappa. Where it is not
+# significant they are tried above this kappa.
+FITTED, FREED = 0.3, 0.1
+# Rounds of a search: each takes so many steps, and judges the PSFs. It ends where a round lowers
+# the misfit by less than so many of its standard deviations.
+ROUNDS, STEPS, IMPROVED = 4, 2, 0.3
+# PSFs are next taken to be wrong by so many times what they were, at most by `FIRST_ERROR`.
+LOOSE = 2.0
+# Of PSFs that are left wrong by more than this it is warned; of those whose pixels were fitted, by
+# more than `FIRST_ERROR`.
+NOTABLE = 0.03
+# Of more stars in the window the least squares would take more memory than the run.
+MOST_STARS = 64
+# A step is halved so often, at most, until no OTF exceeds its value at frequency 0.
+MAX_HALVED = 10
+
+
+@dataclass(frozen=True)
+class _State:
+    """PSFs, the estimate by which they are judged, and whether stars may move for them."""
+
+    psfs: Psfs
+    estimate: Judged
+    moves: bool
+
+    @property
+    def misfit(self) -> PsfMisfit:
+        return self.estimate.misfit
+
+    def is_mended_by(self, other: _State) -> bool:
+        """Return whether other PSFs or positions mend enough to be taken."""
+        before, after = self.misfit, other.misfit
+        if (_of_stars(other) < FADED * _of_stars(self)).any():
+            return False  # a sharper PSF, and the star's light in the extended source
+        if after.expected < FADED * before.expected:
+            return False  # stars that dominate nowhere show no misfit
+        is_less = before.significance - after.significance > GONE
+        return is_less and (not after.is_doubtful or after.kappa < MENDED * before.kappa)
+
+
+def mend(
+    setup: Setup,
+    names: Sequence[str],
+    moves: bool | str,
+    is_asked: bool,
+    tick: Callable[[], object] = int,
+) -> Mended:
+    """Return a setup whose positions and PSFs are mended where the images ask for it.
+
+    Stars are moved first, then the noise of PSFs is taken from their wings, the families are
+    fitted, and pixels freed. Each is tried only where the misfit before is in doubt. It is taken
+    where it leaves less than half of kappa, or nothing to doubt, and every star more than half its
+    flux. Wings without noise are taken where they lower kappa.
+
+    Free pixels fit any star, and may take some of its surroundings for the PSF. So they are to
+    leave less than 0.3 of kappa, and the error that is allowed for is the one before them.
+
+    Parameters
+    ----------
+    setup : Setup
+        The images, the given PSFs and the parameters of the runs; one star or more among them.
+    names : sequence of str
+        Families of `PsfFamilies` that may be refined.
+    moves : bool or "auto"
+        Whether stars are moved; "auto": where that mends a misfit.
+    is_asked : bool
+        Whether the outcome is wanted though PSFs may fit.
+    tick : callable, optional
+        Is called after each iteration of the runs.
+    """
+    observation, runs = setup.observation, GuardedRuns(setup, tick)
+    if len(runs.stars) > MOST_STARS and not (is_asked or len(observation.psf_scatter)):
+        number = counted(len(runs.stars), "star")
+        note(f"PSFs are not judged: {number} in the window; name `refine_psfs` to judge them")
+        return Mended(setup)
+    psfs = observation.psfs_over_images
+    given = _State(psfs, runs.fit(psfs, runs.stars, moves is True), moves is True)
+    state = given
+    if state.misfit.is_doubtful and moves == "auto":
+        state = _move(runs, state)
+    if state.misfit.is_doubtful and names and (observation.psfs < 0).any():
+        state = _clean(runs, state)
+    of_parameters = [name for name in names if name != "pixels"]
+    families = PsfFamilies(of_parameters, observation.replace(psfs=state.psfs))
+    values, tried, left = np.zeros((observation.n_images, len(families.prior))), state, None
+    is_fitted = False  # whether the PSFs used have these values
+    done = ["the noise of wings taken"] if state.psfs is not psfs else []
+    if state.misfit.is_doubtful and families.parameters:
+        tried, values = _fit(runs, families, state, moves is not False)
+        if is_fitted := state.is_mended_by(tried):
+            state = tried
+            done.append(f"{' and '.join(of_parameters)} fitted")
+    if state.misfit.is_doubtful and _shows_pixels(state.misfit) and "pixels" in names:
+        fitted, first = tried, min(state, tried, key=lambda each: each.misfit.kappa)
+        loose = _loosen(runs, first)
+        tried = _free_pixels(runs, observation.psf_scatter, loose, moves is not False)
+        if _is_trusted(tried, loose, state.misfit.kappa):
+            left, state, is_fitted = state.misfit, tried, first is fitted
+            done.append("pixels fitted")
+    is_accepted = state.psfs is not psfs
+    if is_accepted:
+        observation = observation.replace(psfs=state.psfs)
+    known = observation.psf_scatter
+    is_told = state is not given or given.misfit.is_significant
+    estimate = replace(state.estimate, misfit=left or state.misfit)
+    allowance = Allowance(observation, runs, estimate, known)
+    near_stars = allowance.near_stars(setup.pad)
+    if not (is_asked or len(known) or is_told):
+        changed = replace(setup, observation=observation, refine_positions=state.moves)
+        return Mended(changed, None, near_stars, True)
+    _tell(given, state, tried, done)
+    refinement = PsfRefinement(
+        tuple(families.parameters),
+        values / families.units if is_fitted or not is_accepted else 0.0 * values,
+        (given.misfit.reduced, state.misfit.reduced),
+        is_accepted,
+        allowance.error,
+        allowance.edges,
+        allowance.in_rings,
+        allowance.may_be_faked(),
+        left is not None,
+        state.misfit.hidden if state is not given else 0.0,
+    )
+    _warn(refinement)
+    # Replicas draw PSFs from it, so that the errors of regions contain that of the PSFs.
+    if not len(known) and len(scatter := allowance.scatter()):
+        observation = observation.replace(psf_scatter=scatter)
+    changed = replace(setup, observation=observation, refine_positions=state.moves)
+    return Mended(changed, refinement, near_stars, not allowance.error)
+
+
+def _of_stars(state: _State) -> Array:
+    """Return the fluxes of the stars, electrons."""
+    return state.estimate.star_fluxes[: state.estimate.scene.n_stars]
+
+
+def _shows_pixels(misfit: PsfMisfit) -> bool:
+    """Return whether a misfit is enough for free pixels, which else follow the noise."""
+    return misfit.is_significant or misfit.kappa > FREED
+
+
+def _move(runs: GuardedRuns, state: _State) -> _State:
+    """Return the state with the stars where they fit best, where that mends it."""
+    moved = replace(state, estimate=runs.fit(state.psfs, runs.stars, True), moves=True)
+    return moved if state.is_mended_by(moved) else state
+
+
+def _clean(runs: GuardedRuns, state: _State) -> _State:
+    """Return the state with the noise taken from the wings of PSFs, where that lowers kappa."""
+    q = runs.observation.oversample
+    psfs = mapped(state.psfs, lambda _, stack: without_noise(stack, q))
+    stars = state.estimate.scene.places
+    cleaned = _State(psfs, runs.fit(psfs, stars, state.moves), state.moves)
+    return cleaned if cleaned.misfit.kappa < CLEANED * state.misfit.kappa else state
+
+
+def _fit(
+    runs: GuardedRuns, families: PsfFamilies, state: _State, moves: bool
+) -> tuple[_State, Array]:
+    """Return the state with the PSFs of families that fit best, and their values."""
+    firsts = [families.first(search) for search in range(families.n_searches)]
+    found = [_search(runs, families, first, state, moves) for first in firsts]
+    parameters, fitted = min(found, key=lambda each: each[1].misfit.reduced)
+    if len(found) > 1:  # phases of one image may be right in one search, of another in another
+        squares = [each.misfit.squares for _, each in found]
+        best = np.argmin(squares, axis=0)
+        values = [found[search][0].values[j] for j, search in enumerate(best)]
+        first = parameters._replace(values=np.array(values))
+        again = _search(runs, families, first, fitted, moves)
+        if again[1].misfit.reduced < fitted.misfit.reduced:
+            parameters, fitted = again
+    return fitted, parameters.values
+
+
+def _loosen(runs: GuardedRuns, state: _State) -> _State:
+    """Return the state with an extended source that is smoothed as in the reconstruction.
+
+    One that is kept from the stars more strongly leaves its own errors to pixels that are free.
+    """
+    stars = state.estimate.scene.places
+    return replace(state, estimate=runs.fit(state.psfs, stars, state.moves, guard=STRENGTH))
+
+
+def _free_pixels(runs: GuardedRuns, scatter: Array, state: _State, moves: bool) -> _State:
+    """Return the state with PSFs whose pixels are free, as far as scatter or residuals show."""
+    observation = runs.seen_through(state.psfs)
+    scatter = runs.cut(scatter)
+    if not len(scatter):
+        rings = state.misfit.in_rings
+        scatter = estimate_scatter(observation.psfs, rings, observation.oversample)
+    families = PsfFamilies(("pixels",), observation, scatter)
+    parameters, found = _search(runs, families, families.first(), state, moves, STRENGTH)
+    changes = [families.correction(j, parameters) for j in range(observation.n_images)]
+    return replace(found, psfs=runs.completed(state.psfs, changes))
+
+
+def _is_trusted(tried: _State, state: _State, given: float) -> bool:
+    """Return whether free pixels leave little of kappa, and change no star's flux by more than it.
+
+    The wings of free PSFs may take the light of a host, and their cores that of a star. The state
+    is the one that they begin from; given is kappa before, which families may have lowered.
+    """
+    before, after = _of_stars(state), _of_stars(tried)
+    is_near = abs(after - before) <= state.misfit.kappa * before
+    is_fitted = tried.misfit.kappa < FITTED * given
+    return is_fitted and bool(is_near.all())
+
+
+def _search(
+    runs: GuardedRuns,
+    families: PsfFamilies,
+    parameters: PsfParameters,
+    state: _State,
+    moves: bool,
+    guard: float = GUARD,
+) -> tuple[PsfParameters, _State]:
+    """Return the parameters of the least misfit that a search finds, and the state with them."""
+    found: list[tuple[PsfParameters, _State]] = []
+    error, estimate = state.misfit.kappa, state.estimate
+    for _ in range(ROUNDS):
+        parameters, stars = _step(runs, families, parameters, estimate, moves)
+        psfs = families.psfs_over_images(parameters)
+        estimate = runs.fit(psfs, stars, moves, min(FIRST_ERROR, LOOSE * error), guard)
+        gain = found[-1][1].misfit.significance - estimate.misfit.significance if found else np.inf
+        found.append((parameters, _State(psfs, estimate, moves)))
+        if gain < IMPROVED:
+            break
+        error = estimate.misfit.kappa
+    return min(found, key=lambda each: each[1].misfit.reduced)
+
+
+def _step(
+    runs: GuardedRuns,
+    families: PsfFamilies,
+    parameters: PsfParameters,
+    estimate: Judged,
+    moves: bool,
+) -> tuple[PsfParameters, Array]:
+    """Return the parameters and the stars after a few steps from an estimate."""
+    stars = estimate.scene.places
+    found = runs.moved(estimate, families.psfs_over_images(parameters), estimate.star_fluxes, stars)
+    for _ in range(STEPS):
+        change = step(found, families, parameters, moves)
+        parameters, stars = _follow(families, parameters, change.parameters), change.positions
+        if moves:  # which a common shift is not told from
+            parameters, common = families.without_common_shift(parameters)
+            is_through = found.scene.owned[:: found.scene.n_epochs, None] < 0
+            stars = stars + is_through * common / found.scene.oversample
+        psfs = families.psfs_over_images(parameters)
+        found = runs.moved(found, psfs, change.star_fluxes, stars)
+    return parameters, found.scene.places
+
+
+def _follow(
+    families: PsfFamilies, parameters: PsfParameters, change: PsfParameters
+) -> PsfParameters:
+    """Return the parameters after a step, shortened until the PSFs are those of some light."""
+    for halved in range(MAX_HALVED):
+        after = parameters.plus(change, 0.5**halved)
+        if families.are_possible(after):
+            return after
+    return parameters
+
+
+def _tell(given: _State, state: _State, tried: _State, done: Sequence[str]) -> None:
+    """Say in a line what was done."""
+    before, after, found = (each.misfit.reduced for each in (given, state, tried))
+    if done:
+        note(
+            f"PSFs refined, {', '.join(done)}: their misfit is {after:.3g} instead of "
+            f"{before:.3g}, where noise gives 1"
+        )
+    elif state.moves and not given.moves:
+        note(
+            f"positions refined: the misfit of the stars is {after:.3g} instead of {before:.3g}, "
+            "where noise gives 1"
+        )
+    elif tried is not given:
+        note(
+            f"PSFs left as given: their misfit is {before:.3g}, refined {found:.3g}, "
+            "where noise gives 1; too much of the error is left, or a star loses its light"
+        )
+    else:
+        note(f"the misfit of the PSFs is {before:.3g}, where noise gives 1")
+
+
+def _warn(refinement: PsfRefinement) -> None:
+    if refinement.has_free_pixels and refinement.psf_error > FIRST_ERROR:
+        warn(
+            f"the PSFs given do not fit the stars, by {100 * refinement.psf_error:.0f} %, and "
+            "their pixels were fitted there: see whether they are of these images, and sampled "
+            "alike"
+        )
+    if not refinement.has_free_pixels and refinement.psf_error > NOTABLE:
+        warn(
+            f"the PSFs do not fit the stars, by {100 * refinement.psf_error:.2g} %: trust nothing "
+            "fainter than this near the stars"
+        )

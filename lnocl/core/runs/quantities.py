@@ -1,0 +1,138 @@
+"""The quantities of a reconstruction whose errors replicas give, and how they are measured."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from lnocl.core.runs.outcome import Outcome
+from lnocl.core.runs.replicas import Sky
+from lnocl.core.scene.apertures import AMOUNT, FLUX, LENGTH, Aperture, Label, Profile
+from lnocl.core.scene.arrays import Array
+from lnocl.core.scene.detector import on_sky
+from lnocl.core.scene.forward_model import Model
+from lnocl.core.scene.scene import Scene
+from lnocl.core.scene.shifting import Cutout
+from lnocl.core.scene.texture import CORE
+
+BELOW, UNDER, UNSEEN = "below the resolution", "under a star", "not observed"
+
+Part = Aperture | Profile
+
+
+class Quantity(NamedTuple):
+    """A quantity whose error a bootstrap estimates.
+
+    Attributes
+    ----------
+    name : str
+        Its name, such as "star 1 flux".
+    kind : str
+        "flux", in electrons, "length", in pixels, or "halo", in electrons of one image.
+    value : float
+        Its value in the reconstruction.
+    note : str
+        Why its error may not hold; else empty.
+    at : float or None
+        Position along a profile, pixels.
+
+    Examples
+    --------
+    >>> from lnocl.core.runs.bootstrap import Quantity
+    >>> Quantity("star 1 flux", "flux", 1000.0)
+    Quantity(name='star 1 flux', kind='flux', value=1000.0, note='', at=None)
+    """
+
+    name: str
+    kind: str
+    value: float
+    note: str = ""
+    at: float | None = None
+
+
+def measure(outcome: Outcome, sky: Sky, parts: Sequence[Part]) -> Array:
+    """Return the values of all quantities in a sky: fluxes, places, then parts."""
+    fluxes = in_electrons(outcome, sky.star_fluxes)
+    shown = outcome.scene.is_shown[: outcome.scene.n_stars]
+    positions = sky.star_positions[shown].ravel() if outcome.moves else np.zeros(0)
+    return np.concatenate(
+        [fluxes, positions, *(part.measure(sky.extended, sky.light) for part in parts)]
+    )
+
+
+def in_electrons(outcome: Outcome, fluxes: Array) -> Array:
+    """Return the fluxes of stars that are shown, and of halos in electrons of their images."""
+    n, is_shown = outcome.scene.n_stars, outcome.scene.is_shown
+    return np.append(fluxes[:n], outcome.of_halos(fluxes).ravel())[is_shown]
+
+
+def quantities_of(
+    outcome: Outcome, parts: Sequence[Part], width: float
+) -> tuple[tuple[Quantity, ...], Array]:
+    """Return the quantities in the order of `measure`, and the share of each star's light in each.
+
+    The shares have a row for each quantity, and a column for each flux of a star or halo.
+    """
+    scene = outcome.scene
+    n_epochs, images = scene.observation.n_epochs, range(scene.n_images)
+    epochs = [f" epoch {e}" for e in range(n_epochs)] if n_epochs > 1 else [""]
+    shown = np.flatnonzero(scene.is_shown[: scene.n_stars]).tolist()
+    labels = [Label(f"star {s // n_epochs + 1}{epochs[s % n_epochs]} flux", FLUX) for s in shown]
+    halos = range(len(scene.observation.halos))
+    labels += [Label(f"halo {k + 1} image {j + 1}", AMOUNT) for k in halos for j in images]
+    n_fluxes = len(labels)
+    if outcome.moves:
+        labels += [Label(f"star {s + 1} {axis}", LENGTH) for s in shown for axis in "xy"]
+    notes, shares = [""] * len(labels), [*np.eye(len(labels), n_fluxes)]
+    if parts:
+        observed = _observed(scene)
+        cutouts = [[scene.psf_on_sky(j, s) for j in images] for s in shown]
+    for part in parts:
+        own, slices = part.labels(), part.slices if isinstance(part, Profile) else [part]
+        held = np.zeros((len(own), n_fluxes))  # widths hold no light
+        for k, i in np.ndindex(len(slices), len(shown)):
+            held[k, i] = _light_within(slices[k], cutouts[i], scene.grid)
+        own_notes = [_note(each, scene, width, observed) for each in slices]
+        if isinstance(part, Aperture) and part.n_pixels < np.pi / 4.0 * width**2:
+            own_notes = [BELOW]
+        notes += own_notes * (len(own) // len(slices))
+        labels, shares = labels + own, [*shares, *held]
+    light = outcome.light().sky() if parts else outcome.sky
+    sky = Sky(outcome.estimate.observed_sky, light, outcome.star_fluxes, scene.stars)
+    values = measure(outcome, sky, parts).tolist()
+    quantities = tuple(
+        Quantity(label.name, label.kind, value, note, label.at)
+        for label, value, note in zip(labels, values, notes, strict=True)
+    )
+    return quantities, np.reshape(shares, (len(labels), n_fluxes))
+
+
+def _light_within(aperture: Aperture, cutouts: Sequence[Cutout], grid: tuple[int, int]) -> float:
+    """Return the mean light of cutouts on the periodic grid within an aperture."""
+    light = np.zeros(aperture.weights.shape)
+    for cutout in cutouts:
+        cutout.add_to(light, (aperture.y, aperture.x), grid, 1.0 / len(cutouts))
+    return float((aperture.weights * light).sum())
+
+
+def _observed(scene: Scene) -> Array:
+    """Return 1 where the extended source was observed, else 0."""
+    observed = np.ones(scene.grid)
+    if scene.weights is not None:
+        model = Model(scene)
+        observed *= scene.observed(model.adjoint(model.weights))
+    ny, nx = scene.observation.sky_shape
+    return observed[:ny, :nx]
+
+
+def _note(aperture: Aperture, scene: Scene, width: float, observed: Array) -> str:
+    """Return why the error of an aperture may not hold, as where a star's core fills most of it."""
+    if aperture.flux(observed) < 0.5 * aperture.n_pixels:
+        return UNSEEN
+    rows, columns = aperture.places
+    stars = on_sky(scene.stars, scene.oversample)
+    is_core = [np.hypot(rows - y, columns - x) <= CORE * width for x, y in stars]
+    most = max(((aperture.weights * each).sum() for each in is_core), default=0.0)
+    return UNDER if most > 0.5 * aperture.n_pixels else ""

@@ -1,0 +1,54 @@
+"""A reconstruction that is made again of other counts."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+
+from lnocl.core.runs.halos import settle_halos
+from lnocl.core.runs.outcome import Outcome, marginalise
+from lnocl.core.runs.run import Run
+from lnocl.core.runs.start import make_start
+from lnocl.core.scene.arrays import Array
+from lnocl.core.scene.star_prior import StarPrior
+from lnocl.process import ignored_warnings
+
+
+class Repeated:
+    """Reconstructions like one, of images with the same background, PSFs and bad pixels.
+
+    They are made by as many iterations, with the same penalty, from the same start. All use the
+    buffers and programs of one run.
+
+    Parameters
+    ----------
+    outcome : Outcome
+        The reconstruction.
+    """
+
+    def __init__(self, outcome: Outcome) -> None:
+        self._outcome = outcome
+        with ignored_warnings():  # those of the reconstruction are the same
+            self._start = settle_halos(make_start(outcome.setup, outcome.scene.penalty))
+        self._run = Run(self._start, max(len(outcome.objectives) - 1, 1))
+
+    def of(self, counts: Array, prior: StarPrior | None = None) -> Outcome:
+        """Return the reconstruction of images with these counts, shape (p, ny, nx).
+
+        `prior` takes the place of that of the reconstruction, where there is one.
+
+        Raises
+        ------
+        NotFiniteError, DivergedError
+            Its objective is not finite, or rises.
+        """
+        run, outcome = self._run, self._outcome
+        if prior is not None:
+            run.scene.star_prior = prior.scaled(run.scene.unit, run.scene.scale)
+        run.repeat(self._start, outcome.scene.observation.replace(images=counts))
+        with np.errstate(over="ignore", invalid="ignore"):
+            for _ in run:
+                pass
+        wanted = outcome.is_marginal, outcome.has_marginal_halos, outcome.has_levels
+        return dataclasses.replace(outcome, estimate=marginalise(run.estimate(), *wanted))

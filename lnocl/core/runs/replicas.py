@@ -1,0 +1,151 @@
+"""Replicas of a reconstruction: skies that it may stand for, observed and reconstructed alike."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import NamedTuple, cast
+
+import numpy as np
+
+from lnocl.core.runs.outcome import Outcome
+from lnocl.core.runs.repeated import Repeated
+from lnocl.core.scene.arrays import Array
+from lnocl.core.scene.estimate import Estimate
+from lnocl.core.scene.forward_model import Model
+from lnocl.core.scene.psf_field import Psfs, mapped
+from lnocl.core.scene.psf_pixels import PsfPixels
+from lnocl.core.scene.star_prior import StarPrior
+from lnocl.core.scene.texture import Texture, hidden_radii, resolution
+
+
+class Sky(NamedTuple):
+    """A sky: what was drawn, or what was found.
+
+    Attributes
+    ----------
+    extended : ndarray of float64, shape (ny, nx)
+        Extended source, electrons per pixel.
+    light : ndarray of float64, shape (ny, nx)
+        Its light without bias (`lnocl.core.solvers.light`), where it was found.
+    star_fluxes : ndarray of float64, shape (n,)
+        Electrons.
+    star_positions : ndarray of float64, shape (n, 2)
+        Pixels.
+    """
+
+    extended: Array
+    light: Array
+    star_fluxes: Array
+    star_positions: Array
+
+
+class Replica(NamedTuple):
+    """A sky that was drawn, what was found of it, and what was where the PSFs were wrong too."""
+
+    drawn: Sky
+    found: Sky
+    found_with_psfs: Sky | None
+
+
+class Replicas:
+    """Reconstructions of observations that are drawn from an answer.
+
+    Replica k has a sky drawn from `lnocl.core.scene.texture.Texture`, with the stars as they were
+    found. Its counts are drawn from the model of that, with exposures, bad pixels, background and
+    read noise as observed, and reconstructed by as many iterations, with the same penalty, from the
+    same start. All replicas use the buffers and programs of one run.
+
+    Where the scatter of the PSFs is known, or an error of them was found, the same sky is also seen
+    through PSFs that are drawn from it, with the same noise, and reconstructed with those of the
+    answer.
+
+    Parameters
+    ----------
+    outcome : Outcome
+        The answer.
+    seed : int
+        Replica k depends on this and k alone.
+    """
+
+    def __init__(self, outcome: Outcome, seed: int) -> None:
+        self._outcome, self._seed, scene = outcome, seed, outcome.scene
+        width = resolution(scene)
+        self._texture = Texture(
+            outcome.estimate.extended, scene.shown_stars, width, hidden_radii(scene, width)
+        )
+        self._model = Model(scene)
+        observation = scene.observation
+        self._added = observation.read_noise**2
+        self._pixels = None
+        if len(observation.psf_scatter):
+            self._pixels = PsfPixels(
+                observation.psfs, observation.psf_scatter, observation.oversample
+            )
+        self._repeated = Repeated(outcome)
+
+    def reconstruct(self, k: int) -> Replica:
+        """Return replica k.
+
+        Raises
+        ------
+        NotFiniteError, DivergedError
+            Its objective is not finite, or rises.
+        """
+        scene = self._outcome.scene
+        of_sky, of_psfs, *of_images, of_prior = np.random.SeedSequence([self._seed, k]).spawn(
+            scene.n_images + 3
+        )
+        sky = self._texture.draw(np.random.default_rng(of_sky))
+        extended = Estimate.of_scaled(scene, sky, self._outcome.estimate.fluxes).observed_sky
+        drawn = Sky(extended, extended, self._outcome.star_fluxes, scene.stars)
+        models = list(self._means(self._model, sky))
+        counts = self._draw(models, of_images)
+        prior, star_fluxes = scene.penalty.stars, self._outcome.star_fluxes
+        prior = prior and prior.drawn(star_fluxes, np.random.default_rng(of_prior))
+        found = self._find(counts, prior)
+        if self._pixels is None:
+            return Replica(drawn, found, None)
+        others = self._means(Model(scene.seen_through(self._draw_psfs(of_psfs))), sky)
+        # The same noise: counts that are drawn of almost the same mean may be quite others.
+        changed = [n + b - a for n, a, b in zip(counts, models, others, strict=True)]
+        return Replica(drawn, found, self._find(np.maximum(changed, 0.0), prior))
+
+    def _find(self, counts: Array, prior: StarPrior | None) -> Sky:
+        """Return the reconstruction of an observation with these counts and this prior."""
+        found = self._repeated.of(counts, prior)
+        places = found.scene.stars.copy()  # the scene moves its stars for the next
+        return Sky(found.estimate.observed_sky, found.light().sky(), found.star_fluxes, places)
+
+    def _draw_psfs(self, seed: np.random.SeedSequence) -> Psfs:
+        psfs = self._outcome.scene.observation.psfs
+        rng = np.random.default_rng(seed)
+        # One PSF for all images has one error.
+        is_shared = psfs.strides[0] == 0
+        fields = rng.standard_normal(psfs[:1].shape if is_shared else psfs.shape)
+        fields = np.broadcast_to(fields, psfs.shape)
+        changes = [cast(PsfPixels, self._pixels).correction(j, x) for j, x in enumerate(fields)]
+        over_images = self._outcome.scene.observation.psfs_over_images
+        return mapped(over_images, lambda j, stack: stack + changes[j])
+
+    def _draw(self, models: Sequence[Array], seeds: Sequence[np.random.SeedSequence]) -> Array:
+        """Return counts of these models, shape (p, ny, nx)."""
+        with ThreadPoolExecutor() as pool:
+            return np.array(list(pool.map(_draw, models, self._added, seeds)))
+
+    def _means(self, model: Model, sky: Array) -> Iterator[Array]:
+        """Yield the model of each image, electrons."""
+        scene = self._outcome.scene
+        images = model.images(sky, self._outcome.estimate.fluxes)
+        ny, nx = scene.observation.shape
+        for j, image in enumerate(images):
+            yield scene.in_electrons(image, j)[:ny, :nx]
+
+
+def _draw(model: Array, added: Array, seed: np.random.SeedSequence) -> Array:
+    """Return counts with read noise of this variance, which images and model have had added."""
+    rng = np.random.default_rng(seed)
+    counts = rng.poisson(np.maximum(model - added, 0.0)).astype(np.float64)
+    if np.any(added):
+        counts += rng.standard_normal(counts.shape) * np.sqrt(added)
+    return np.maximum(counts + added, 0.0)

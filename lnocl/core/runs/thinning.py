@@ -1,0 +1,45 @@
+"""Data thinning: the counts of an observation split at random into two halves."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from lnocl.core.scene.observation import Observation
+from lnocl.errors import InputError
+
+# Binomial samples are drawn as 64-bit integers.
+MAX_COUNTS = 2.0**62
+SEED = 0
+
+
+def split_counts(observation: Observation) -> tuple[Observation, Observation]:
+    """Return two halves of an observation, its counts split at random.
+
+    A Poisson count is split binomially, so that its halves are independent Poisson counts of half
+    its mean. The fraction of a number that is not whole goes to one of the halves, which keeps
+    their variances those of counts to 1/16. The seed is fixed.
+
+    Raises
+    ------
+    InputError
+        The images hold no counts, or too many in a pixel.
+    """
+    images = observation.images
+    if not images.any():
+        raise InputError("the images hold no counts to hold out; give `n_iter` and `stop` None")
+    if images.max() > MAX_COUNTS:
+        raise InputError(
+            f"a pixel of {images.max():.3g} electrons is too bright to be split; give `n_iter` and "
+            "`stop` None"
+        )
+    rng = np.random.default_rng(SEED)
+    first = np.empty_like(images)
+    for image, half in zip(images, first, strict=True):
+        whole = np.floor(image)
+        half[:] = rng.binomial(whole.astype(np.int64), 0.5)
+        half += (image - whole) * rng.integers(0, 2, image.shape)
+    background = observation.background / 2.0
+    return (
+        observation.replace(images=first, background=background),
+        observation.replace(images=images - first, background=background),
+    )

@@ -1,0 +1,105 @@
+"""The penalty on the estimate, beside the data term of the objective."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass, field
+from numbers import Real
+from typing import Any, cast
+
+import numpy as np
+
+from lnocl.core.scene.arrays import Array
+from lnocl.core.scene.counts import mean_exposure
+from lnocl.core.scene.detector import seen_psfs
+from lnocl.core.scene.observation import Observation
+from lnocl.core.scene.star_prior import StarPrior
+from lnocl.errors import InputError
+
+# A larger weight leaves nothing of the data term of images at unit mean.
+MAX_WEIGHT = 2.0**64
+
+# The weight of the edge-preserving term in units of the noise of the gradient of the data term:
+# docs/validation/sgp.md.
+SMOOTHING = 0.1
+
+# To which Python compares an integer of any size without making a float of it.
+MAX_FLOAT = sys.float_info.max
+
+
+@dataclass(frozen=True)
+class Penalty:
+    """``mu / 2 sum F^2 + smoothing sum psi(F - F')``, over pixels, and over pairs of neighbours.
+
+    F is the extended source in electrons, at one exposure: the unit of time has no part in it.
+
+    ``psi(t) = sqrt(t^2 + delta^2) - delta`` is the hypersurface potential (Charbonnier et al. 1997,
+    IEEE Trans. Image Process. 6, 298): steps far below delta are smoothed as by a quadratic term,
+    while of an edge far above it only the height counts, so that it stays sharp.
+
+    Attributes
+    ----------
+    mu : float
+        Weight of the Tikhonov term, per electron, zero or more.
+    smoothing : float
+        Weight of the edge-preserving term, zero or more. It has no unit.
+    edge : float or None
+        delta, in the unit of the extended source; None: three times its mean, roughly.
+    near_stars : ndarray of float64, of the shape of the extended source, or None
+        Weight of the edge-preserving term beside `smoothing` in each pixel; a pair of pixels has
+        the mean of both. None: 0 everywhere.
+    stars : StarPrior or None
+        Of star fluxes, electrons, which the objective leaves out.
+    exposure : float or None
+        That of F. None: the mean of the observation's, of which tiles have each their own.
+
+    Raises
+    ------
+    InputError
+        A weight that is not a number, negative or not finite.
+    """
+
+    mu: float = 0.0
+    smoothing: float = 0.0
+    edge: float | None = None
+    near_stars: Array | None = field(default=None, compare=False)
+    stars: StarPrior | None = field(default=None, compare=False)
+    exposure: float | None = None
+
+    def __post_init__(self) -> None:
+        weights: dict[str, Any] = {"mu": self.mu, "smoothing": self.smoothing}
+        for name, weight in weights.items():
+            if not (isinstance(weight, Real) and _is_weight(cast(float, weight))):
+                raise InputError(
+                    f"`{name}` must be a number, finite and not negative; {weight!r} was given"
+                )
+
+    def in_words(self) -> str:
+        """Return the weight of the edge-preserving term as a message has it."""
+        near = self.near_stars
+        more = "" if near is None else f", and up to {near.max():.3g} more at the stars"
+        return f"{self.smoothing:.3g}{more}"
+
+
+def recommend_smoothing(observation: Observation) -> float:
+    """Return the weight of the edge-preserving term that suits the noise of an observation.
+
+    It is `SMOOTHING` times the standard deviation of the gradient of the data term by the noise of
+    the counts, ``sqrt(sum_j <e_j^2 / g_j> sum K_j^2)``, e_j the exposures over their mean, < > the
+    mean over the observed pixels, K_j as these see it.
+    """
+    relative = observation.exposure / mean_exposure(observation)
+    if relative.ndim == 1:
+        relative = relative[:, None, None]
+    variance = np.ma.masked_array(
+        relative**2 / np.maximum(observation.images, 1.0), observation.mask
+    ).mean(axis=(1, 2))
+    squares = (seen_psfs(observation) ** 2).sum(axis=(1, 2))
+    return SMOOTHING * float(np.sqrt((variance * squares).sum()))
+
+
+def _is_weight(number: float) -> bool:
+    try:
+        return 0 <= float(number) <= MAX_FLOAT
+    except OverflowError:  # of whole numbers
+        return False

@@ -1,0 +1,68 @@
+"""The weights of a penalty, in the units of a scene."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from lnocl.core.scene.arrays import Array
+from lnocl.core.scene.penalty import MAX_WEIGHT, Penalty
+from lnocl.core.scene.star_prior import StarPrior
+from lnocl.core.scene.transforms import enlarged
+from lnocl.errors import InputError
+
+if TYPE_CHECKING:
+    from lnocl.core.scene.scene import Scene
+
+# delta of the edge-preserving term, in means of a flat extended source: docs/validation/sgp.md.
+EDGE = 3.0
+
+
+class Scaled(NamedTuple):
+    """The attributes of the same names of `lnocl.core.scene.scene.Scene`."""
+
+    mu: float
+    smoothing: float
+    smoothing_map: Array | None
+    edge: float
+    star_prior: StarPrior | None
+
+
+def scaled(penalty: Penalty, scene: Scene) -> Scaled:
+    """Return the weights of a penalty in the units of a scene.
+
+    Raises
+    ------
+    InputError
+        One is too large for float32.
+    """
+    longer = 1.0 if penalty.exposure is None else penalty.exposure / scene.mean_exposure
+    smoothing = _scaled("smoothing", penalty.smoothing, longer, scene)
+    smoothing_map, edge = _smoothing_map(penalty, smoothing, scene), 0.0
+    if smoothing > 0 or smoothing_map is not None:
+        edge = EDGE * scene.rough_fit.level if penalty.edge is None else penalty.edge / scene.unit
+    return Scaled(
+        _scaled("mu", penalty.mu, scene.scale * longer**2, scene),
+        smoothing,
+        smoothing_map,
+        edge,
+        penalty.stars and penalty.stars.scaled(scene.unit, scene.scale),
+    )
+
+
+def _smoothing_map(penalty: Penalty, smoothing: float, scene: Scene) -> Array | None:
+    """Return the weight of the edge-preserving term on the grid, where it is a map."""
+    if penalty.near_stars is None:
+        return None
+    return np.asarray(smoothing + enlarged(penalty.near_stars, scene.grid))
+
+
+def _scaled(name: str, weight: float, factor: float, scene: Scene) -> float:
+    """Return a weight of the penalty, scaled."""
+    if weight * factor > MAX_WEIGHT:
+        raise InputError(
+            f"`{name}` {weight:g} is too large for images of about {scene.scale:g} electrons "
+            f"per pixel; the most that means anything there is {MAX_WEIGHT / factor:g}"
+        )
+    return float(weight) * factor if weight else 0.0  # the factor may be infinite

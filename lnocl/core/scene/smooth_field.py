@@ -1,0 +1,34 @@
+"""Random fields that are smooth."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from lnocl.core.scene.arrays import Array
+
+
+class SmoothField:
+    r"""The root of a covariance of unit variance, ``C(d) = exp(-d^2 / (2 width^2))``, periodic.
+
+    ``apply`` makes of white noise x the field :math:`C^{1/2} x`. It is its own transpose.
+
+    Parameters
+    ----------
+    shape : tuple of int
+        Shape (ny, nx) of the field.
+    width : float
+        Pixels.
+    """
+
+    def __init__(self, shape: tuple[int, ...], width: float) -> None:
+        self._shape = shape
+        u, v = np.fft.rfftfreq(shape[1]), np.fft.fftfreq(shape[0])[:, None]
+        root = np.exp(-((np.pi * width) ** 2) * (u**2 + v**2))
+        self._root = root / np.sqrt(np.fft.irfft2(root**2, shape)[0, 0])
+
+    def apply(self, x: Array) -> Array:
+        """Return the field of x, shape (ny, nx)."""
+        from scipy import fft  # which the start of a command need not load
+
+        spectrum = self._root * fft.rfft2(x, workers=-1)
+        return np.asarray(fft.irfft2(spectrum, self._shape, workers=-1), np.float64)

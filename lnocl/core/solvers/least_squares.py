@@ -1,0 +1,360 @@
+r"""Joint least squares for a few parameters and for large Gaussian random fields.
+
+The residual of image j, ``g_j - m_j``, is modelled as ``J_j eta + B_j x``. The vector eta is the
+change of a few parameters, and J_j holds the derivatives of the model. The vector x is the change
+of the fields, whose values are independent and standard normal a priori, and B_j their linear
+effect. P_j are the inverse variances of the pixels, Pi those of the prior of the parameters. From
+the current values eta_0 and x_0 the changes minimise
+
+.. math::
+    \sum_j \| P_j^{1/2} (g_j - m_j - J_j \eta - B_j x) \|^2
+    + \|x_0 + x\|^2 + (\eta_0 + \eta)^T \Pi (\eta_0 + \eta)
+
+Eliminating eta leaves a linear system for x, which conjugate gradients solve. Its matrix is the
+Schur complement of the block of eta. The covariance of eta and x is the inverse of half the second
+derivative of this sum.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from typing import NamedTuple, Protocol
+
+import numpy as np
+import scipy.linalg
+from numpy.typing import NDArray
+
+from lnocl.core.scene.arrays import Array
+from lnocl.core.scene.smooth_field import SmoothField
+
+# A variance may be too small by this share of it, and a change off by so many standard errors.
+MISSING, NEGLIGIBLE = 1e-4, 1e-4
+# Added to the diagonal of the information, which is scaled to 1 before.
+ROUNDING = 1e-12
+
+
+class LinearImage(NamedTuple):
+    """An image and its model, linear near the current estimate.
+
+    Attributes
+    ----------
+    slopes : ndarray of float64, shape (n, Ny * Nx)
+        Derivatives of the model with respect to the n parameters that it depends on.
+    unknowns : ndarray of int, shape (n,)
+        Indices of these among all parameters, without repeats.
+    left : ndarray of float64, shape (Ny, Nx)
+        The residuals ``g_j - m_j``.
+    precision : ndarray of float64, shape (Ny, Nx)
+        One over the Poisson variance of each pixel.
+    """
+
+    slopes: Array
+    unknowns: NDArray[np.int_]
+    left: Array
+    precision: Array
+
+    def beside(self, slopes: list[Array], unknowns: NDArray[np.int_]) -> LinearImage:
+        """Return the image with more unknowns, and the derivatives with respect to these."""
+        if not slopes:
+            return self
+        each = np.append(self.slopes, np.reshape(slopes, (len(slopes), -1)), axis=0)
+        return self._replace(slopes=each, unknowns=np.append(self.unknowns, unknowns))
+
+
+class Field(Protocol):
+    """A random field of independent standard normal values, and its linear effect on the images.
+
+    Attributes
+    ----------
+    at : ndarray of float64
+        The current value of x, where the models are linear.
+    """
+
+    at: Array
+
+    def forward(self, x: Array) -> Iterable[Array]:
+        """Return the changes of the images, shape (p, Ny, Nx)."""
+
+    def adjoint(self, images: Sequence[Array]) -> Array:
+        """Return the transpose of `forward` applied to images, in the shape of x."""
+
+
+class SourceError:
+    """The error of the extended source as a random field, ``a C^(1/2) x``.
+
+    C is the correlation matrix of the error; its effect on image j is ``A_j (a C^(1/2) x)``.
+
+    Parameters
+    ----------
+    forward : callable
+        Returns the images ``A_j f``, shape (p, Ny, Nx), of a sky f, shape (Ny, Nx).
+    adjoint : callable
+        Returns ``sum_j A_j^T y_j``, shape (Ny, Nx), of p images y.
+    amplitude : ndarray of float64, shape (Ny, Nx)
+        The standard deviation a of the error, in the unit of the sky.
+    width : float
+        Pixels over which it is correlated (`lnocl.core.scene.smooth_field.SmoothField`).
+
+    Attributes
+    ----------
+    images_of : callable
+        The parameter `forward`.
+    at : ndarray of float64, shape (Ny, Nx)
+        The current value of x, which is 0.
+    """
+
+    def __init__(
+        self,
+        forward: Callable[[Array], Array],
+        adjoint: Callable[[Iterable[Array]], Array],
+        amplitude: Array,
+        width: float,
+    ) -> None:
+        self.images_of, self._adjoint, self._amplitude = forward, adjoint, amplitude
+        self._smooth = SmoothField(amplitude.shape, width)
+        self.at = np.zeros(amplitude.shape)
+
+    def forward(self, x: Array) -> Array:
+        """Return the changes of the images, shape (p, Ny, Nx)."""
+        return self.images_of(self.of(x))
+
+    def of(self, x: Array) -> Array:
+        """Return the change of the extended source, ``a C^(1/2) x``, shape (Ny, Nx)."""
+        return np.asarray(self._amplitude * self._smooth.apply(x))
+
+    def adjoint(self, images: Sequence[Array]) -> Array:
+        """Return the transpose of `forward` applied to images, shape (Ny, Nx)."""
+        return self._smooth.apply(self._amplitude * self._adjoint(images))
+
+
+class LevelError:
+    """The error of a level of the extended source, the same in all pixels, as a field of one value.
+
+    Parameters
+    ----------
+    deviation : float
+        The standard deviation of the error, in the unit of the sky.
+    responses : ndarray of float64, shape (p, 1, 1) or (p, Ny, Nx)
+        The light of a sky of 1 in a pixel of each image.
+    shape : tuple of int
+        Shape (Ny, Nx) of the images.
+
+    Attributes
+    ----------
+    at : ndarray of float64, shape (1,)
+        The current value, which is 0.
+    """
+
+    def __init__(self, deviation: float, responses: Array, shape: tuple[int, int]) -> None:
+        self._levels, self._shape, self.at = deviation * responses, shape, np.zeros(1)
+
+    def forward(self, x: Array) -> Array:
+        """Return the changes of the images, shape (p, Ny, Nx)."""
+        levels = x[0] * self._levels
+        return np.broadcast_to(levels, (len(levels), *self._shape))
+
+    def adjoint(self, images: Sequence[Array]) -> Array:
+        """Return the transpose of `forward` applied to images, shape (1,)."""
+        pairs = zip(self._levels, images, strict=True)
+        return np.array([sum(np.sum(a * (y if a.size > 1 else y.sum())) for a, y in pairs)])
+
+
+class LeastSquares:
+    """The joint least squares of a few parameters and of random fields.
+
+    Parameters
+    ----------
+    images : list of LinearImage
+        The images, of one shape.
+    fields : list of Field
+        The fields; one at least.
+    prior : ndarray of float64, shape (k,) or (k, k)
+        One over the variance of the prior of each parameter, whose mean is 0; 0 for no prior. Or
+        the inverse of their covariance.
+    n_steps : int
+        Steps of conjugate gradients, at most.
+    finished : float
+        They end where the norm of the residual is this share of the first.
+
+    Attributes
+    ----------
+    information : ndarray of float64, shape (k, k)
+        The Fisher information of the parameters with the fields held, and that of the prior.
+    """
+
+    def __init__(
+        self,
+        images: list[LinearImage],
+        fields: Sequence[Field],
+        prior: Array,
+        n_steps: int,
+        finished: float,
+    ) -> None:
+        self._images, self._fields = images, fields
+        self._prior = prior = np.diag(prior) if prior.ndim == 1 else prior
+        self._n_steps, self._finished = n_steps, finished
+        self._ends = np.cumsum([field.at.size for field in fields])[:-1]
+        self.information = information = prior.copy()
+        for each in images:
+            block = _sum("ik,jk->ij", each.slopes * each.precision.ravel(), each.slopes)
+            information[np.ix_(each.unknowns, each.unknowns)] += block
+        self._units = 1.0 / np.sqrt(np.maximum(np.diag(information), np.finfo(float).tiny))
+        scaled = information * self._units * self._units[:, None]
+        # Stars that nothing tells apart leave it singular.
+        self._factor = scipy.linalg.cho_factor(scaled + ROUNDING * np.eye(len(prior)))
+
+    def solve(self, at: Array | None = None) -> tuple[Array, list[Array]]:
+        """Return the changes of the parameters and of the fields that minimise the sum.
+
+        Parameters
+        ----------
+        at : ndarray of float64, shape (k,), optional
+            The current values of the parameters, which the prior draws towards 0; by default 0.
+
+        Returns
+        -------
+        change : ndarray of float64, shape (k,)
+            To add to `at`.
+        fields : list of ndarray of float64
+            To add to `at` of each field.
+        """
+        at = np.zeros(len(self._prior)) if at is None else at
+        change, x = self._solve(self._prior @ at)
+        return change, self._each(x)
+
+    def variances(self, unknowns: Sequence[int] | NDArray[np.int_]) -> Array:
+        """Return the variances of some parameters, with the others and the fields marginalised.
+
+        They are too small by less than `MISSING` of them, or where `finished` or `n_steps` ends
+        conjugate gradients. One parameter has ``F^-1_ii + <w_i, S^-1 w_i>``, F the information,
+        w_i what the parameter does to the fields and S `_curvature`. The w_i of one star in many
+        epochs are much alike. So x with ``S x = w_i`` is found for one of them, and its part taken
+        from all: with ``<x, S x> = 1``, ``w_i -= <x, w_i> S x`` leaves ``<x, w_i>^2`` less of
+        ``<w_i, S^-1 w_i>``. No direction has less than 1 in S, so that ``|w_i|^2`` bounds the rest.
+        """
+        if not len(unknowns):
+            return np.zeros(0)
+        columns = [self._invert(unit) for unit in np.eye(len(self._prior))[unknowns]]
+        found = np.array([column[i] for column, i in zip(columns, unknowns, strict=True)])
+        rests = np.array([self._adjoint(self._changes(column)) for column in columns])
+        least = self._finished**2 * _squares(rests)
+        for _ in columns:
+            squares, enough = _squares(rests), np.maximum(least, MISSING * found)
+            worst = int(np.argmax(squares / enough))
+            if squares[worst] <= enough[worst]:
+                break
+            x, left = self._descend(rests[worst], float(enough[worst]))
+            image = rests[worst] - left
+            shares, square = _sum("ik,k->i", rests, x), float(_sum("i,i", x, image))
+            rests -= shares[:, None] * (image / square)
+            found += shares**2 / square
+        return found
+
+    def row(self, unknown: int) -> tuple[float, Array]:
+        """Return the variance of one parameter, and its change by each residual, (p, Ny, Nx)."""
+        direct = self._invert(np.eye(len(self._prior))[unknown])
+        seen = self._changes(direct)
+        wanted = self._adjoint(seen)
+        x = self._find_fields(wanted)
+        of_fields = self._forward(x)
+        seen += self._changes(self._invert(self._moments(of_fields))) - of_fields
+        for image, each in zip(seen, self._images, strict=True):
+            image *= each.precision
+        return float(direct[unknown] + _sum("i,i", wanted, x)), seen
+
+    def _left(self) -> Array:
+        """Return the residuals of all images, shape (p, Ny, Nx)."""
+        return np.array([each.left for each in self._images])
+
+    def _solve(self, pull: Array) -> tuple[Array, Array]:
+        """Return the changes of the parameters, shape (k,), and of the fields, one after the other.
+
+        `pull` is half the gradient of the prior of the parameters, shape (k,).
+        """
+        left = self._left()
+        direct = self._invert(self._moments(left) - pull)
+        at = np.concatenate([field.at.ravel() for field in self._fields])
+        x = self._find_fields(self._adjoint(left - self._changes(direct)) - at)
+        return self._invert(self._moments(left - self._forward(x)) - pull), x
+
+    def _find_fields(self, wanted: Array) -> Array:
+        """Return x with ``S x = wanted``.
+
+        What is left in that bounds by how many standard errors parameters and fields are off.
+        """
+        least = self._finished**2 * float(_sum("i,i", wanted, wanted))
+        return self._descend(wanted, max(least, NEGLIGIBLE**2))[0]
+
+    def _descend(self, wanted: Array, least: float) -> tuple[Array, Array]:
+        """Return x with ``S x = wanted`` by conjugate gradients from 0, and what is left of it.
+
+        `_curvature` applies S. They end where the square of what is left is at most `least`.
+        """
+        x, rest, along = np.zeros_like(wanted), wanted, wanted
+        square = float(_sum("i,i", rest, rest))
+        for _ in range(self._n_steps):
+            if square <= least:
+                break
+            image = self._curvature(along)
+            share = square / float(_sum("i,i", along, image))
+            x, rest = x + share * along, rest - share * image
+            before, square = square, float(_sum("i,i", rest, rest))
+            along = rest + square / before * along
+        return x, rest
+
+    def _curvature(self, x: Array) -> Array:
+        """Return ``S x``, S half the second derivative in the fields, the parameters eliminated.
+
+        S is the Schur complement of the block of the parameters.
+        """
+        images = self._forward(x)
+        images -= self._changes(self._invert(self._moments(images)))
+        return x + self._adjoint(images)
+
+    def _each(self, x: Array) -> list[Array]:
+        """Return the fields in their shapes, from all their values one after the other."""
+        parts = zip(np.split(x, self._ends), self._fields, strict=True)
+        return [part.reshape(field.at.shape) for part, field in parts]
+
+    def _forward(self, x: Array) -> Array:
+        """Return the changes of the images by the fields, shape (p, Ny, Nx)."""
+        images = np.zeros((len(self._images), *self._images[0].left.shape))
+        for field, part in zip(self._fields, self._each(x), strict=True):
+            for image, change in zip(images, field.forward(part), strict=True):
+                image += change
+        return images
+
+    def _adjoint(self, images: Array) -> Array:
+        """Return ``sum_j B_j^T P_j y_j`` of images y, the fields one after the other."""
+        weighted = [each.precision * x for each, x in zip(self._images, images, strict=True)]
+        return np.concatenate([field.adjoint(weighted).ravel() for field in self._fields])
+
+    def _moments(self, images: Array) -> Array:
+        """Return ``sum_j J_j^T P_j y_j`` of images y, shape (k,)."""
+        moments = np.zeros(len(self._prior))
+        for each, image in zip(self._images, images, strict=True):
+            weighted = (each.precision * image).ravel()
+            moments[each.unknowns] += _sum("ik,k->i", each.slopes, weighted)
+        return moments
+
+    def _changes(self, change: Array) -> Array:
+        """Return the changes of the models, shape (p, Ny, Nx), where the unknowns change."""
+        images = np.zeros((len(self._images), *self._images[0].left.shape))
+        for image, each in zip(images, self._images, strict=True):
+            if (own := change[each.unknowns]).any():
+                image[:] = _sum("i,ik->k", own, each.slopes).reshape(image.shape)
+        return images
+
+    def _invert(self, moments: Array) -> Array:
+        """Return the inverse of `information` applied to a vector, shape (k,)."""
+        return np.asarray(self._units * scipy.linalg.cho_solve(self._factor, self._units * moments))
+
+
+def _squares(vectors: Array) -> Array:
+    """Return the square of each row."""
+    return _sum("ik,ik->i", vectors, vectors)
+
+
+def _sum(products: str, a: Array, b: Array) -> Array:
+    """Return an Einstein sum without BLAS, whose rounding depends on the number of threads."""
+    return np.asarray(np.einsum(products, a, b))

@@ -1,0 +1,265 @@
+"""The least squares of a star and of the extended source round it, in a window.
+
+The extended source is a field of the covariance that `lnocl.core.scene.texture` expects, and a
+level of about its mean there: an estimate that is positive holds light where there is none. So the
+fluxes and positions of stars, and their errors, depend on no iteration. For errors the amounts of
+halos are unknown too: what the images tell of them beyond the window is their prior in it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from functools import cached_property
+
+import numpy as np
+import scipy.fft
+from numpy.typing import NDArray
+
+from lnocl.core.scene.arrays import Array
+from lnocl.core.scene.camera import Camera, adjoint_of, seen_by
+from lnocl.core.scene.estimate import Estimate
+from lnocl.core.scene.scene import Scene
+from lnocl.core.scene.texture import Texture, hidden_radii, hidden_radius, resolution
+from lnocl.core.scene.transforms import enlarged
+from lnocl.core.scene.view import Places, View, Window
+from lnocl.core.solvers.fluxes import precision
+from lnocl.core.solvers.least_squares import (
+    Field,
+    LeastSquares,
+    LevelError,
+    LinearImage,
+    SourceError,
+)
+from lnocl.core.solvers.sources import Sources
+
+# Side of the window round a star, and how far off other stars may be that are not taken as known,
+# resolutions.
+WINDOW, NEIGHBOURS = 9.0, 4.0
+# What lies farther from a window has no part in the texture there, resolutions.
+MARGIN = 3.0
+# Steps of conjugate gradients at most.
+N_STEPS = 2000
+
+
+class Surroundings:
+    """What the windows of all stars of an estimate share.
+
+    Parameters
+    ----------
+    estimate : Estimate
+        What is modelled, and how bright it is.
+    moves : bool
+        Whether positions are unknown too; else they are taken as known.
+    raised : ndarray of float64, shape (n_shapes,), optional
+        How many times the variance of each halo is that with the extended source known
+        (`lnocl.core.solvers.halos.HaloErrors`). Halos are unknown then; by default they are known.
+
+    Attributes
+    ----------
+    width : float
+        The resolution, pixels of the sky.
+    hidden : ndarray of float64, shape (n_shown,)
+        Radii round stars that are shown in which no image has observed a pixel, pixels of the sky.
+    n_shapes : int
+        Halos of each image that are unknown.
+    """
+
+    def __init__(self, estimate: Estimate, moves: bool, raised: Array | None = None) -> None:
+        self.estimate, self.moves = estimate, moves
+        self.scene = scene = estimate.scene
+        self.width = resolution(scene)
+        self.hidden = hidden_radii(scene, self.width)
+        self.cameras = [Camera(scene, j) for j in range(scene.n_images)]
+        self.n_shapes = 0 if raised is None else len(raised)
+        self._roots = np.zeros(0) if raised is None else raised**-0.5
+        self._precisions = self._find_precisions() if self.n_shapes else []
+
+    def _find_precisions(self) -> list[Array]:
+        scene = self.scene
+        weights = np.ones((1, 1, 1)) if scene.weights is None else scene.weights
+        weights = np.broadcast_to(weights, (scene.n_images, *scene.image_grid))
+        models = self.estimate.models()
+        return [precision(scene, model, w) for model, w in zip(models, weights, strict=True)]
+
+    def beyond(self, j: int, window: Window) -> Array:
+        """Return what image j tells of its halos beyond a window, the extended source unknown.
+
+        That is their information, shape (n_shapes, n_shapes), less by the factors `raised`.
+        """
+        scene, precisions = self.scene, self._precisions[j].copy()
+        precisions[window.of(scene.image_grid)] = 0.0
+        of_image = range(scene.n_stars + j, scene.n_fluxes, scene.n_images)
+        halos = np.array([scene.star_image(j, k) for k in of_image])
+        halos *= self._roots[:, None, None]
+        return np.asarray(np.einsum("hyx,yx,iyx->hi", halos, precisions, halos, optimize=True))
+
+
+class NearStar:
+    """One star, those near it, and the extended source round them.
+
+    All is computed in a window: arrays on the grid would take more memory than the run.
+
+    Parameters
+    ----------
+    around : Surroundings
+        The estimate.
+    star : int
+        The star.
+    finished : float
+        The share of the gradient at which conjugate gradients end.
+
+    Attributes
+    ----------
+    window : Window
+        The pixels of the images, without offset.
+    held : ndarray of int, shape (n_held,)
+        Stars that are fitted: this, which is the first, and those near it. Halos follow in the
+        unknowns, shape by shape, and then positions.
+    unknowns : ndarray of int, shape (n_held, 1 or 3)
+        Those of each: its flux, and perhaps x and y, which it has in all epochs.
+    resolution : float
+        What all images resolve together, pixels of the sky.
+    hidden : float
+        The radius round the star in which no image has observed a pixel, pixels of the sky.
+    source : SourceError
+        The extended source less its expected mean, in the window.
+    expected : ndarray of float64
+        That mean less the estimate, in the window of the sky, scaled.
+    """
+
+    def __init__(self, around: Surroundings, star: int, finished: float) -> None:
+        scene, width = around.scene, around.width
+        self.hidden = hidden_radius(scene, scene.stars[star], width)
+        self.window = _window_round(scene, scene.stars[star], WINDOW * width + 2.0 * self.hidden)
+        self._views = [View.round(scene, j, self.window) for j in range(scene.n_images)]
+        self.held = np.append(star, _neighbours(scene, star, width))
+        halos = scene.n_stars + np.arange(around.n_shapes * scene.n_images)
+        sources = Sources(around.estimate, np.append(self.held, halos), around.moves)
+        self.unknowns, self.resolution, self._finished = sources.unknowns, width, finished
+        there, texture = _texture_in(self.window, around)
+        self.source = self._source_error(around, texture.amplitude[there], texture.width)
+        self.expected = texture.mean[there] - around.estimate.part(self.places(scene))
+        level = float(texture.mean[there].mean())
+        self._level = LevelError(level, self._responses(around), self.window.shape)
+        beyond = self.source.images_of(self.expected)
+        self._images = [
+            self._linearise(around, sources, *each)
+            for each in zip(self._views, around.cameras, beyond, strict=True)
+        ]
+        self._prior = self._prior_of_halos(around, sources.n)
+
+    def _responses(self, around: Surroundings) -> Array:
+        """Return what a flat sky of ones is in the window of each image."""
+        scene, shape = around.scene, self.window.shape
+        if scene.transmission is None:
+            return (scene.gains * scene.areas)[:, None, None]
+        ones = np.broadcast_to(1.0, scene.grid)
+        pairs = zip(around.cameras, self._views, strict=True)
+        return np.array([enlarged(a.part(ones, v.window.ranges), shape) for a, v in pairs])
+
+    def places(self, scene: Scene) -> Places:
+        """Return the rows and columns of the window in the sky, on the grid."""
+        return self.window.finer(scene.oversample).of(scene.grid)
+
+    def level_shares(self, change: Array) -> Array:
+        """Return how much an unknown falls where levels of the background rise, shape (p, 3).
+
+        `change` is its change by each residual in the window, shape (p, height, width).
+        """
+        pairs = zip(change, self._views, strict=True)
+        return np.array(
+            [
+                [np.vdot(each, enlarged(level, each.shape)) for level in v.levels]
+                for each, v in pairs
+            ]
+        )
+
+    @cached_property
+    def fit(self) -> LeastSquares:
+        """The least squares of stars, halos, and extended source and its level."""
+        fields: list[Field] = [self.source, self._level]
+        return LeastSquares(self._images, fields, self._prior, N_STEPS, self._finished)
+
+    def _prior_of_halos(self, around: Surroundings, n: int) -> Array:
+        p, k = around.scene.n_images, len(self.held)
+        prior, first = np.zeros((n, n)), k + p * np.arange(around.n_shapes)
+        for j, view in enumerate(self._views if around.n_shapes else []):
+            prior[np.ix_(first + j, first + j)] = around.beyond(j, view.window)
+        return prior
+
+    def _source_error(self, around: Surroundings, amplitude: Array, width: float) -> SourceError:
+        """Return the error of the extended source in the window, and its change there."""
+        shape, sky = self.window.shape, self.window.finer(around.scene.oversample).ranges
+        windows = [
+            camera.window(view.window.ranges, sky)
+            for camera, view in zip(around.cameras, self._views, strict=True)
+        ]
+
+        def forward(sky: Array) -> Array:
+            return np.array([enlarged(each, shape) for each in seen_by(windows, sky)])
+
+        def adjoint(images: Iterable[Array]) -> Array:
+            pairs = zip(windows, images, strict=True)
+            held = (image[: each.shape[0], : each.shape[1]] for each, image in pairs)
+            return adjoint_of(windows, held)
+
+        return SourceError(forward, adjoint, amplitude, width)
+
+    def _linearise(
+        self, around: Surroundings, sources: Sources, view: View, camera: Camera, beyond: Array
+    ) -> LinearImage:
+        """Return an image near the estimate, in arrays of the window.
+
+        `beyond` is the light of the sky that is expected, less that of the estimate.
+        """
+        image = sources.linear(view, view.model(around.estimate, camera))
+        n, shape = len(image.unknowns), self.window.shape
+        slopes = enlarged(image.slopes.reshape(n, *view.window.shape), shape)
+        return LinearImage(
+            slopes.reshape(n, math.prod(shape)),
+            image.unknowns,
+            enlarged(image.left, shape) - beyond,
+            enlarged(image.precision, shape),
+        )
+
+
+def _texture_in(window: Window, around: Surroundings) -> tuple[tuple[slice, slice], Texture]:
+    """Return the texture round a window of the images, and where the window lies in it."""
+    scene, width = around.scene, around.width
+    window = window.finer(scene.oversample)
+    margin = int(np.ceil(MARGIN * width))
+    (y, height), (x, breadth) = (
+        (first - margin, k + 2 * margin) if k + 2 * margin < n else (first, n)
+        for first, k, n in zip((window.y, window.x), window.shape, scene.grid, strict=True)
+    )
+    whole = Window(y, x, (height, breadth))
+    stars = (scene.shown_stars - (x, y)) % scene.grid[::-1]
+    inside = (stars < (breadth, height)).all(axis=1)
+    there = tuple(
+        slice(first - start, first - start + k)
+        for first, start, k in zip((window.y, window.x), (y, x), window.shape, strict=True)
+    )
+    extended = around.estimate.part(whole.of(scene.grid))
+    return (there[0], there[1]), Texture(extended, stars[inside], width, around.hidden[inside])
+
+
+def _window_round(scene: Scene, star: Array, side: float) -> Window:
+    """Return a window of so many pixels of the sky round a star.
+
+    It is the whole axis of the grid where that is not twice as long.
+    """
+    length = int(np.ceil(side / scene.oversample))
+    size = scipy.fft.next_fast_len(length, real=True)
+    height, width = (size if 2 * size <= n else n for n in scene.image_grid)
+    x, y = np.round(star).astype(int).tolist()
+    return Window(y - height // 2, x - width // 2, (height, width))
+
+
+def _neighbours(scene: Scene, star: int, resolution: float) -> NDArray[np.int_]:
+    """Return which other stars are near one; those beyond are taken as known."""
+    size = np.array(scene.grid[::-1])
+    away = scene.oversample * (scene.stars - scene.stars[star])
+    away = (away + size / 2) % size - size / 2
+    near = np.flatnonzero(np.hypot(*away.T) <= NEIGHBOURS * resolution)
+    return near[near != star]

@@ -1,0 +1,95 @@
+r"""Standard errors of stars whose extended source is not known either.
+
+The joint Fisher information of the stars' fluxes and positions and of the extended source is
+
+.. math:: \begin{pmatrix} J^T P J & J^T P A L \\ L^T A^T P J & 1 + L^T A^T P A L \end{pmatrix},
+
+with J the derivatives of the models ``m_j``, of halos too, whose amounts are unknown, P one over
+their variances, A the convolutions, and ``L = a C^(1/2)`` the root of the covariance that the
+extended source is expected to have (`lnocl.core.scene.texture`), with a column for its level: what
+lies under a star nothing but this tells from it. The variance of a star is a diagonal element of
+the inverse. The extended source is eliminated by its Schur complement, with conjugate gradients, in
+a window round each star (`lnocl.core.solvers.near_star`).
+
+A level of the background that is not known adds the square of what it changes in a star.
+
+The same least squares tell how far a star is from where they are least, as the extended source is
+not where it is expected or iterations have ended early. The square of that is added.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lnocl.core.scene.arrays import Array
+from lnocl.core.scene.estimate import Estimate
+from lnocl.core.solvers.fluxes import variances
+from lnocl.core.solvers.halos import halo_errors
+from lnocl.core.solvers.levels import Levels
+from lnocl.core.solvers.near_star import NearStar, Surroundings
+
+# The share of the gradient at which conjugate gradients end.
+FINISHED = 1e-8
+
+
+def standard_errors(
+    estimate: Estimate,
+    moves: bool,
+    raised: Array | None = None,
+    levels: Levels | None = None,
+    finished: float = FINISHED,
+) -> Array:
+    """Return the standard errors of stars, with halos and extended source marginalised.
+
+    Parameters
+    ----------
+    estimate : Estimate
+        What is modelled, and how bright it is.
+    moves : bool
+        Whether positions were fitted too; else they are taken as known.
+    raised : ndarray of float64, shape (n_shapes,), optional
+        As of `lnocl.core.solvers.halos.halo_errors`, where that is known already.
+    levels : Levels, optional
+        Those of the background, where they are not known.
+    finished : float
+        The share of the gradient at which conjugate gradients end.
+
+    Returns
+    -------
+    ndarray of float64, shape (n, 3)
+        Of flux, electrons, x and y, pixels; NaN for positions that were not fitted, and where the
+        images do not determine a star.
+    """
+    if raised is None:
+        raised = halo_errors(estimate).raised
+    scene, around = estimate.scene, Surroundings(estimate, moves, raised)
+    errors = np.full((scene.n_stars, 3), np.nan)
+    n_epochs, k = scene.observation.n_epochs, 3 if moves else 1
+    for first in range(0, scene.n_stars, n_epochs):  # which lies there in all epochs
+        near = NearStar(around, first, finished)
+        there = range(first, first + n_epochs)
+        errors[first : first + n_epochs, :k] = _errors_of(near, np.isin(near.held, there), levels)
+    errors[:, 0] *= scene.unit
+    return errors
+
+
+def _errors_of(near: NearStar, wanted: NDArray[np.bool_], levels: Levels | None) -> Array:
+    """Return the errors of stars that are fitted, of their fluxes and perhaps x and y."""
+    fit = near.fit
+    unknowns = near.unknowns[wanted]
+    is_determined = np.isfinite(variances(fit.information))
+    if not is_determined.any():
+        return np.full(unknowns.shape, np.nan)
+    change, _ = fit.solve()
+    errors = np.full(unknowns.shape, np.nan)
+    known = is_determined[unknowns]
+    at, again = np.unique(unknowns[known], return_inverse=True)
+    if levels is None:
+        found = fit.variances(at)
+    else:
+        rows = (fit.row(i) for i in at.tolist())
+        shares = [(each, near.level_shares(by_residuals)) for each, by_residuals in rows]
+        found = np.array([each + levels.variance_of(share) for each, share in shares])
+    errors[known] = np.sqrt(found + change[at] ** 2)[again]
+    return errors
