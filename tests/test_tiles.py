@@ -141,9 +141,9 @@ def test_fields_must_serve_all_images():
     ("known", "tile", "are_tiles"),
     [
         ({}, None, True),
-        ({"transforms": [np.eye(2, 3), [[0, -1, N - 1], [1, 0, 0]]]}, None, False),
-        ({"epochs": [0, 1]}, None, False),
-        ({"epochs": [0, 1]}, 48, True),  # which is refused
+        ({"transforms": [np.eye(2, 3), [[0, -1, N - 1], [1, 0, 0]]]}, None, True),
+        ({"halos": [np.ones((N, N))]}, None, False),
+        ({"halos": [np.ones((N, N))]}, 48, True),  # which is refused
     ],
 )
 def test_the_shell_takes_tiles_where_psfs_vary_and_tiles_take_the_images(known, tile, are_tiles):

@@ -238,7 +238,7 @@ def test_a_compressed_file_is_unpacked_as_far_as_its_headers_say(
     sound, tmp_path, monkeypatch, compress
 ):
     """Gigabytes may follow its zeros; that these are not read, their damaged end shows."""
-    monkeypatch.setattr(packed, "TAIL", 2**14)
+    monkeypatch.setattr(packed, "PART", 2**14)
     rest = bytes(BLOCK) + np.random.default_rng(0).bytes(3 * 2**19)
     path = tmp_path / "a.fits.packed"
     whole = sound["image.dat"].read_bytes()
