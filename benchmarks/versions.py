@@ -31,7 +31,10 @@ WORKER = """
 import sys, time
 import numpy as np
 import sides
-from lnocl.core.scene.scene import Scene
+try:
+    from lnocl.core.scene.scene import Scene
+except ModuleNotFoundError:  # a version from before the core had a folder
+    from lnocl.scene.scene import Scene
 size, n_images, n_stars = int(sys.argv[1]), int(sys.argv[2]), int(sys.argv[4])
 stars = np.random.default_rng(1).uniform(40, size - 40, (n_stars, 2))
 scene = Scene(sides.observation(size, n_images), stars)
