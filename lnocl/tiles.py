@@ -317,7 +317,7 @@ def _alone(result: Result, **changes: Any) -> Result:
 
 def _outcome(prepared: Prepared, tile: Tile) -> Outcome:
     prepared = prepared.of(tile.observation, tile.stars).penalised(near_stars=tile.near_stars)
-    outcome = reconstruct(prepared)
+    outcome = reconstruct(prepared, own=tile.own)
     if prepared.fits and len(tile.stars):
         outcome = outcome.marginal(stars=True, halos=False, levels=False)
     return replace(outcome, psf_refinement=prepared.refinement)

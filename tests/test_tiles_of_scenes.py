@@ -4,6 +4,8 @@ Sources and PSFs are Gaussians, each PSF with a ghost beside it, so that images 
 the pixels of the sky too.
 """
 
+import warnings
+
 import numpy as np
 import pytest
 from turned_scenes import COVARIANCES, gaussian, psf
@@ -12,6 +14,7 @@ import lnocl
 from lnocl import tiles, tiling
 from lnocl.core.scene.estimate import Estimate
 from lnocl.core.scene.scene import Scene
+from lnocl.core.scene.star_check import warn_of_stars
 
 SHAPE = 40, 56
 # Of the image whose pixels are larger.
@@ -191,3 +194,29 @@ def test_tiles_are_the_whole_and_the_sky_that_was_simulated(kind):
         assert (abs(each.star_fluxes - fluxes) < 3 * each.star_flux_errors).all()
         assert abs(each.extended_flux[0] - sky.sum()) < 3 * each.extended_flux[1]
     assert found.fit().rms == pytest.approx(whole.fit().rms, rel=0.01)
+
+
+@pytest.mark.parametrize("epochs", [None, [0, 1]])
+def test_tiles_warn_of_their_own_stars_alone(epochs):
+    """A neighbour's lies in the corner of what is seen of a turned image, and beyond the other."""
+    y, x = np.indices((13, 13)) - 6
+    observation = lnocl.Observation(
+        np.full((2, 72, 72), 20.0), psf(x, y, COVARIANCES[0]), epochs=epochs,
+        transforms=lnocl.rotations([0.0, 40.0], (35.5, 35.5)),
+    )  # fmt: skip
+    stars = np.stack(np.meshgrid(*[np.arange(13.0, 60.0, 5.0)] * 2), axis=-1).reshape(-1, 2)
+    said = {"own": [], "all": [], "whole": []}
+    laid = tiling.lay(observation, 48, 0)
+    cuts = [tiling.cut(observation, stars, None, spans) for spans in laid]
+    cuts = [tile.without_unseen_neighbours() for tile in cuts]
+    assert sum(len(tile.own) for tile in cuts) == len(stars)
+    scenes = [(Scene(tile.observation, tile.stars), tile.own, "own") for tile in cuts]
+    scenes += [(scene, None, "all") for scene, _, _ in scenes]
+    for scene, own, name in [*scenes, (Scene(observation, stars), None, "whole")]:
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            warn_of_stars(scene, False, own)
+        said[name] += [str(each.message) for each in caught]
+    assert said["own"] == said["whole"] == []
+    assert any("bad pixels" in each for each in said["all"])
+    assert any("its flux there is NaN" in each for each in said["all"]) == (epochs is not None)
