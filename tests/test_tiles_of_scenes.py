@@ -8,6 +8,7 @@ import warnings
 
 import numpy as np
 import pytest
+from scipy.signal import fftconvolve
 from turned_scenes import COVARIANCES, gaussian, psf
 
 import lnocl
@@ -15,6 +16,7 @@ from lnocl import tiles, tiling
 from lnocl.core.scene.estimate import Estimate
 from lnocl.core.scene.scene import Scene
 from lnocl.core.scene.star_check import warn_of_stars
+from lnocl.errors import InputError
 
 SHAPE = 40, 56
 # Of the image whose pixels are larger.
@@ -220,3 +222,25 @@ def test_tiles_warn_of_their_own_stars_alone(epochs):
     assert said["own"] == said["whole"] == []
     assert any("bad pixels" in each for each in said["all"])
     assert any("its flux there is NaN" in each for each in said["all"]) == (epochs is not None)
+
+
+def test_tiles_behind_a_transmission_of_0_have_the_background():
+    y, x = np.indices((9, 9)) - 4
+    shares = np.ones((80, 96))
+    shares[10:70, 30:80] = 0.0
+    of_star = psf(x, y, COVARIANCES[0])
+    of_star /= of_star.sum()
+    means = 20.0 + fftconvolve(30.0 * shares, of_star, "same")
+    counts = np.random.default_rng(0).poisson(means, (2, 80, 96))
+    observation = lnocl.Observation(counts, of_star, background=20.0, transmission=shares)
+    run = RUN | {"tile": 40, "pad": 4, "n_iter": 10}
+    found = lnocl.deconvolve_tiles(observation, **run)
+    assert len(found.tiles) < len(tiling.lay(observation, 40, 4))
+    models = np.array(list(found._findings.models()))
+    np.testing.assert_allclose(models[:, 30:50, 40:70], 20.0)
+    assert found.fit().rms == pytest.approx(1.0, abs=0.03)
+    with pytest.raises(InputError, match=r"\(55, 40\) lies in a tile .* nothing is transmitted of"):
+        lnocl.deconvolve_tiles(observation, [(55, 40)], **run)
+    behind = observation.replace(star_psfs=0.1 * of_star, star_places=(55, 40))
+    with pytest.raises(InputError, match=r"a star with a PSF of its own, .* a larger tile"):
+        lnocl.deconvolve_tiles(behind, [(55, 40)], **run)
