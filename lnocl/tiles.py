@@ -241,7 +241,7 @@ def deconvolve_tiles(
     prepared = prepare(plan, progress)
     observation, near_stars = prepared.setup.observation, prepared.penalties[0].near_stars
     observed = [*filter(None, (cut(observation, positions, near_stars, at) for at in tiles))]
-    or_dark = " or nothing is transmitted of" if len(observation.transmission) else ""
+    or_dark = " or that is behind a `transmission` of 0" if len(observation.transmission) else ""
     for x, y in np.delete(positions, np.concatenate([each.numbers for each in observed]), axis=0):
         raise InputError(
             f"the star at ({x:g}, {y:g}) lies in a tile that all images mask{or_dark}; leave it "

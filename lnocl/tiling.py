@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lnocl.core.scene.arrays import Array, whole
+from lnocl.core.scene.fields import is_dark
 from lnocl.core.scene.geometry import Box
 from lnocl.core.scene.grid import length_for, psf_shape
 from lnocl.core.scene.observation import Observation
@@ -177,7 +178,7 @@ def cut(
             return None
     moved = positions - (columns.start, rows.start)
     is_seen = part.shows(moved)
-    if len(part.transmission) and not part.transmission[~part.mask.all(axis=(1, 2))].any():
+    if is_dark(part):
         _refuse_own_psfs(part, moved[is_seen], tuple(each.core.start for each in spans))
         return None
     in_spans = [each.holds(at) for each, at in zip(spans, positions.T[::-1], strict=True)]
