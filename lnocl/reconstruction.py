@@ -7,6 +7,9 @@ from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 
+import numpy as np
+from numpy.typing import NDArray
+
 from lnocl.checkpoint import Checkpointer
 from lnocl.core.runs.halves import Halves
 from lnocl.core.runs.held_out import HeldOutCounts
@@ -30,6 +33,7 @@ def reconstruct(
     callback: Callback | None = None,
     progress: bool = False,
     checkpointer: Checkpointer | None = None,
+    own: NDArray[np.intp] | None = None,
 ) -> Outcome:
     """Return the outcome with the first penalty, or with those that held-out counts choose.
 
@@ -43,6 +47,8 @@ def reconstruct(
         As for `deconvolve`.
     checkpointer : Checkpointer, optional
         Writes checkpoints, and holds the one to resume from.
+    own : ndarray of int, optional
+        The stars of which it is warned; by default all.
     """
     setup, penalties, steady = prepared.setup, prepared.penalties, prepared.steady
     n_iter, stop = prepared.n_iter, prepared.stop
@@ -57,7 +63,7 @@ def reconstruct(
 
                 start = settle_halos(start)
         warn_of_noise(setup.observation)
-        warn_of_stars(start.scene, setup.refine_positions)
+        warn_of_stars(start.scene, setup.refine_positions, own)
         told = None
         if steady is not None and start.scene.n_stars:
             told = _run_steadily(start, steady, n_iter, progress)

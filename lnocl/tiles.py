@@ -184,7 +184,8 @@ def deconvolve_tiles(
     ------
     InputError
         As `lnocl.deconvolve`; a tile has no room for its margins; an option is not for tiles; the
-        observation has halos.
+        observation has halos; a star is in a tile that all images mask, or that is behind a
+        transmission of 0.
     LnoclError
         Dask is missing; the workers are lost.
     DeviceError
@@ -241,10 +242,11 @@ def deconvolve_tiles(
     prepared = prepare(plan, progress)
     observation, near_stars = prepared.setup.observation, prepared.penalties[0].near_stars
     observed = [*filter(None, (cut(observation, positions, near_stars, at) for at in tiles))]
+    or_dark = " or that is behind a `transmission` of 0" if len(observation.transmission) else ""
     for x, y in np.delete(positions, np.concatenate([each.numbers for each in observed]), axis=0):
         raise InputError(
-            f"the star at ({x:g}, {y:g}) lies in a tile that all images mask; leave it out or mend "
-            "the mask"
+            f"the star at ({x:g}, {y:g}) lies in a tile that all images mask{or_dark}; leave it "
+            "out or mend the mask"
         )
     if len(tiles) > 1:
         common = {"exposure": mean_exposure(observation)}
@@ -317,7 +319,7 @@ def _alone(result: Result, **changes: Any) -> Result:
 
 def _outcome(prepared: Prepared, tile: Tile) -> Outcome:
     prepared = prepared.of(tile.observation, tile.stars).penalised(near_stars=tile.near_stars)
-    outcome = reconstruct(prepared)
+    outcome = reconstruct(prepared, own=tile.own)
     if prepared.fits and len(tile.stars):
         outcome = outcome.marginal(stars=True, halos=False, levels=False)
     return replace(outcome, psf_refinement=prepared.refinement)
@@ -395,7 +397,9 @@ class _Mosaic:
         # The sky times weights, and these.
         shape = [observation.oversample * len(each.sky) for each in spans]
         self._first, self._sky = [each.sky.start for each in spans], np.zeros((2, *shape))
-        self._models = np.zeros(observation.images.shape)
+        # Where no tile sees the sky images have their background.
+        _, background = together(observation.images, observation.background)
+        self._models = np.zeros(observation.images.shape) + background
         self._stars = np.zeros((len(self.given_positions), 6))
         self.found: list[_Found] = []
 

@@ -10,10 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lnocl.core.scene.arrays import Array, whole
+from lnocl.core.scene.fields import is_dark
 from lnocl.core.scene.geometry import Box
 from lnocl.core.scene.grid import length_for, psf_shape
 from lnocl.core.scene.observation import Observation
 from lnocl.core.scene.scene import Scene
+from lnocl.core.scene.star_psfs import owned
 from lnocl.core.scene.transforms import part as part_of
 from lnocl.errors import InputError
 from lnocl.process import ignored_warnings
@@ -156,7 +158,13 @@ def cut(
     near_stars: Array | None,
     spans: tuple[Span, Span],
 ) -> Tile | None:
-    """Return a tile, or None where nothing was observed."""
+    """Return a tile, or None where nothing of the sky was observed.
+
+    Raises
+    ------
+    InputError
+        It is behind a transmission of 0, and has a star with a PSF of its own.
+    """
     q, (rows, columns) = observation.oversample, (span.window for span in spans)
     if all(span.core == span.sky for span in spans):  # one tile has the images as they are
         ny, nx = observation.shape
@@ -166,10 +174,13 @@ def cut(
         y, x = ((each.core.start + each.core.stop - 1) / 2.0 - each.window.start for each in spans)
         try:
             part = observation.window(rows, columns, (x, y), boxes)
-        except InputError:  # no image has a good pixel there, or the sky is behind 0
+        except InputError:  # no image has a good pixel there
             return None
     moved = positions - (columns.start, rows.start)
     is_seen = part.shows(moved)
+    if is_dark(part):
+        _refuse_own_psfs(part, moved[is_seen], tuple(each.core.start for each in spans))
+        return None
     in_spans = [each.holds(at) for each, at in zip(spans, positions.T[::-1], strict=True)]
     is_own = np.all([is_seen, *in_spans], axis=0)
     own = np.flatnonzero(is_own[is_seen])
@@ -179,3 +190,12 @@ def cut(
         down, along = (range(q * at.start, q * at.stop) for at in (rows, columns))
         near_stars = part_of(near_stars, down, along).copy()
     return Tile(spans, boxes, part, moved[is_seen], own, np.flatnonzero(is_own), core, near_stars)
+
+
+def _refuse_own_psfs(part: Observation, stars: Array, first: tuple[int, ...]) -> None:
+    """Refuse stars with PSFs of their own, which are seen, where nothing else is transmitted."""
+    if (owned(part, stars) >= 0).any():
+        raise InputError(
+            "the tile that begins at pixel ({1}, {0}) has a star with a PSF of its own, and "
+            "`transmission` is 0 all over it; give a larger `tile`".format(*first)
+        )

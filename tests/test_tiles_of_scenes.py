@@ -4,14 +4,19 @@ Sources and PSFs are Gaussians, each PSF with a ghost beside it, so that images 
 the pixels of the sky too.
 """
 
+import warnings
+
 import numpy as np
 import pytest
+from scipy.signal import fftconvolve
 from turned_scenes import COVARIANCES, gaussian, psf
 
 import lnocl
 from lnocl import tiles, tiling
 from lnocl.core.scene.estimate import Estimate
 from lnocl.core.scene.scene import Scene
+from lnocl.core.scene.star_check import warn_of_stars
+from lnocl.errors import InputError
 
 SHAPE = 40, 56
 # Of the image whose pixels are larger.
@@ -191,3 +196,51 @@ def test_tiles_are_the_whole_and_the_sky_that_was_simulated(kind):
         assert (abs(each.star_fluxes - fluxes) < 3 * each.star_flux_errors).all()
         assert abs(each.extended_flux[0] - sky.sum()) < 3 * each.extended_flux[1]
     assert found.fit().rms == pytest.approx(whole.fit().rms, rel=0.01)
+
+
+@pytest.mark.parametrize("epochs", [None, [0, 1]])
+def test_tiles_warn_of_their_own_stars_alone(epochs):
+    """A neighbour's lies in the corner of what is seen of a turned image, and beyond the other."""
+    y, x = np.indices((13, 13)) - 6
+    observation = lnocl.Observation(
+        np.full((2, 72, 72), 20.0), psf(x, y, COVARIANCES[0]), epochs=epochs,
+        transforms=lnocl.rotations([0.0, 40.0], (35.5, 35.5)),
+    )  # fmt: skip
+    stars = np.stack(np.meshgrid(*[np.arange(13.0, 60.0, 5.0)] * 2), axis=-1).reshape(-1, 2)
+    said = {"own": [], "all": [], "whole": []}
+    laid = tiling.lay(observation, 48, 0)
+    cuts = [tiling.cut(observation, stars, None, spans) for spans in laid]
+    cuts = [tile.without_unseen_neighbours() for tile in cuts]
+    assert sum(len(tile.own) for tile in cuts) == len(stars)
+    scenes = [(Scene(tile.observation, tile.stars), tile.own, "own") for tile in cuts]
+    scenes += [(scene, None, "all") for scene, _, _ in scenes]
+    for scene, own, name in [*scenes, (Scene(observation, stars), None, "whole")]:
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            warn_of_stars(scene, False, own)
+        said[name] += [str(each.message) for each in caught]
+    assert said["own"] == said["whole"] == []
+    assert any("bad pixels" in each for each in said["all"])
+    assert any("its flux there is NaN" in each for each in said["all"]) == (epochs is not None)
+
+
+def test_tiles_behind_a_transmission_of_0_have_the_background():
+    y, x = np.indices((9, 9)) - 4
+    shares = np.ones((80, 96))
+    shares[10:70, 30:80] = 0.0
+    of_star = psf(x, y, COVARIANCES[0])
+    of_star /= of_star.sum()
+    means = 20.0 + fftconvolve(30.0 * shares, of_star, "same")
+    counts = np.random.default_rng(0).poisson(means, (2, 80, 96))
+    observation = lnocl.Observation(counts, of_star, background=20.0, transmission=shares)
+    run = RUN | {"tile": 40, "pad": 4, "n_iter": 10}
+    found = lnocl.deconvolve_tiles(observation, **run)
+    assert len(found.tiles) < len(tiling.lay(observation, 40, 4))
+    models = np.array(list(found._findings.models()))
+    np.testing.assert_allclose(models[:, 30:50, 40:70], 20.0)
+    assert found.fit().rms == pytest.approx(1.0, abs=0.03)
+    with pytest.raises(InputError, match=r"lies in a tile .* behind a transmission of 0"):
+        lnocl.deconvolve_tiles(observation, [(55, 40)], **run)
+    behind = observation.replace(star_psfs=0.1 * of_star, star_places=(55, 40))
+    with pytest.raises(InputError, match=r"a star with a PSF of its own, .* a larger tile"):
+        lnocl.deconvolve_tiles(behind, [(55, 40)], **run)

@@ -49,36 +49,43 @@ def faults(result: Result) -> list[str]:
     They are those of stars without light, of stars that moved too far, and of residuals far from
     what noise leaves; and light all round a star, as a PSF that is too narrow leaves it.
     """
-    unfitted, lit, dark, lost = [], [], [], []
+    unfitted, lit, dark, lost = _Told(), _Told(), _Told(), _Told()
     findings, at_stars, overall = result._findings, result.star_residuals(), result.fit()
-    for place, given, flux, found in zip(
-        result.star_positions, findings.given_positions, result.star_fluxes, at_stars, strict=True
-    ):
+    n_epochs = findings.observation.n_epochs
+    for s, (place, given, flux, found) in enumerate(
+        zip(
+            result.star_positions, findings.given_positions, result.star_fluxes, at_stars,
+            strict=True,
+        )
+    ):  # fmt: skip
+        star, epoch = divmod(s, n_epochs)
+        then = f" in epoch {epoch}" if n_epochs > 1 else ""
         if np.isnan(flux):  # no image shows it, as the run has told
             continue
         if not flux > NO_LIGHT:
             where = _elsewhere(result.extended, place, findings.observation.oversample)
-            dark.append(f"{in_words(given)}{where}")
+            dark.add(star, f"{in_words(given)}{then}{where}")
             continue
         if np.hypot(*(place - given)) > AT_LIMIT * MAX_SHIFT:
-            lost.append(f"{in_words(given)} to {in_words(place)}")
+            lost.add(star, f"{in_words(given)} to {in_words(place)}")
         if found.is_misfit:
-            unfitted.append(in_words(place))
+            unfitted.add(star, f"{in_words(place)}{then}")
         if found.has_halo:
-            lit.append(f"{in_words(place)}, {100 * found.halo:.0f} %")
+            lit.add(star, f"{in_words(place)}{then}, {100 * found.halo:.0f} %")
     lines = []
     if dark:
-        lines.append(f"no light is left for {counted(len(dark), 'star')}: {'; '.join(dark[:3])}")
+        lines.append(f"no light is left for {dark.count()}: {dark.words('; ')}")
     if lost:
         lines.append(
-            f"{counted(len(lost), 'star')} moved as far as stars may, {MAX_SHIFT:g} pixels, from "
-            f"{'; '.join(lost[:3])}: give the place where it is brightest"
+            f"{lost.count()} moved as far as stars may, {MAX_SHIFT:g} pixels, from "
+            f"{lost.words('; ')}: give the place where it is brightest"
         )
     if unfitted:
         remedy = ", or try `refine_psfs` jitter pixels" if findings.may_free_pixels else ""
         lines.append(
-            f"the model does not fit at {len(unfitted)} of {counted(len(at_stars), 'star')}, "
-            f"{' '.join(unfitted[:3])}: give a better PSF{remedy}"
+            f"the model does not fit at {len(unfitted)} of "
+            f"{counted(len(at_stars) // n_epochs, 'star')}, {unfitted.words(' ')}: give a better "
+            f"PSF{remedy}"
         )
     elif overall.is_misfit and not (dark or lost):
         lines.append("the model does not fit: see to background, noise and gain")
@@ -92,11 +99,27 @@ def faults(result: Result) -> list[str]:
         )
     if lit:
         lines.append(
-            f"light lies all round {counted(len(lit), 'star')}, as a share of its flux: "
-            f"{'; '.join(lit[:3])}: the PSF is too narrow or lacks its wings, the background is "
-            "too low, or a source lies there"
+            f"light lies all round {lit.count()}, as a share of its flux: {lit.words('; ')}: the "
+            "PSF is too narrow or lacks its wings, the background is too low, or a source lies "
+            "there"
         )
     return lines
+
+
+class _Told(dict[int, dict[str, None]]):
+    """What is told of each star, once where several epochs say the same."""
+
+    def add(self, star: int, words: str) -> None:
+        """Add what is told of a star."""
+        self.setdefault(star, {})[words] = None
+
+    def count(self) -> str:
+        """Return how many stars these are."""
+        return counted(len(self), "star")
+
+    def words(self, between: str) -> str:
+        """Return the first of what is told."""
+        return between.join([each for told in self.values() for each in told][:3])
 
 
 def in_words(place: Iterable[float]) -> str:

@@ -12,6 +12,7 @@ from turned_scenes import FLUXES, GRID, NX, NY, STARS, observation
 import lnocl
 from lnocl.core.scene.forward_model import Model
 from lnocl.core.scene.scene import Scene
+from lnocl.core.scene.star_check import warn_of_stars
 
 pytestmark = pytest.mark.filterwarnings(
     "ignore:psf . is sharper than its pixels", "ignore:the star at .* lies on bad pixels"
@@ -103,11 +104,19 @@ def test_stars_behind_nothing_are_left_out_and_the_others_are_dimmed():
     sky[11, 13] += 5e4
     sky[20, 30] += 9e4
     given = scene_of(sky, np.array([hidden, 0.5 * hidden]))
-    with pytest.warns(lnocl.LnoclWarning, match="masked or nothing is transmitted"):
-        scene = Scene(given, [(13, 11), (30, 20)])
+    scene = Scene(given, [(13, 11), (30, 20)])
+    with pytest.warns(lnocl.LnoclWarning, match=r"masked or not 0\.01 is transmitted"):
+        warn_of_stars(scene, moves=False)
     np.testing.assert_array_equal(scene.is_shown, [True, False])
     means = Model(scene).images(extended / scene.unit, np.array([5e4, 9e4]) / scene.unit)
     np.testing.assert_allclose(scene.scale * means, given.images, rtol=1e-12)
+
+
+def test_a_sky_that_good_pixels_do_not_show_is_refused():
+    shares = np.array([np.zeros((8, 9)), np.ones((8, 9))])
+    given = lnocl.Observation(np.ones((2, 8, 9)), np.ones((3, 3)), transmission=shares)
+    with pytest.raises(lnocl.InputError, match="0 everywhere for the images that have good pixels"):
+        given.replace(mask=shares > 0)
 
 
 def test_a_window_has_its_part_of_the_transmission():

@@ -87,7 +87,11 @@ def test_a_star_that_moved_as_far_as_stars_may_is_named_first():
             smoothing=0.0,
             star_residuals=lambda: [bad],
             fit=Fit,
-            _findings=SimpleNamespace(given_positions=np.array([given]), may_free_pixels=True),
+            _findings=SimpleNamespace(
+                given_positions=np.array([given]),
+                may_free_pixels=True,
+                observation=SimpleNamespace(n_epochs=1),
+            ),
         )
         return faults(result)
 
@@ -95,6 +99,22 @@ def test_a_star_that_moved_as_far_as_stars_may_is_named_first():
     assert lines[0].startswith("1 star moved as far as stars may, 3 pixels, from (10, 10) to (10,")
     assert "does not fit" in lines[1]
     assert len(at(10.0, 10.5)) == 1
+
+
+def test_a_star_counts_once_and_its_epochs_are_named():
+    bad = StarResiduals(Fit(100, 900.0, 200.0), Fit(), 0.2, 0.8)
+    places = np.repeat([(10.0, 13.0), (20.0, 9.0)], 2, axis=0)
+    findings = SimpleNamespace(
+        given_positions=places, may_free_pixels=False, observation=SimpleNamespace(n_epochs=2)
+    )
+    result = SimpleNamespace(
+        star_positions=places, star_fluxes=np.array([5.0, np.nan, 6.0, 7.0]), psf_refinement=None,
+        smoothing=0.0, star_residuals=lambda: [bad] * 4, fit=Fit, _findings=findings,
+    )  # fmt: skip
+    unfitted, lit = faults(result)
+    places = "(10, 13) in epoch 0 (20, 9) in epoch 0 (20, 9) in epoch 1"
+    assert unfitted == f"the model does not fit at 2 of 2 stars, {places}: give a better PSF"
+    assert lit.startswith("light lies all round 2 stars, as a share of its flux: (10, 13) in epoch")
 
 
 @pytest.mark.parametrize("more", [[], ["--quiet"]])

@@ -182,6 +182,14 @@ def test_edge_is_three_times_the_mean_of_the_extended_source(exposure):
     assert Scene(observation, [(4, 3)]).edge == 0.0
 
 
+def test_weights_near_stars_are_at_the_exposure_of_the_penalty_as_that_of_all_is():
+    """A tile that was exposed for less has the same penalty on electrons at the mean of all."""
+    observation = lnocl.Observation(np.full((8, 16), 8.0), np.ones((1, 1)), exposure=2.0)
+    near = np.linspace(0.0, 0.3, 128).reshape(8, 16)
+    scene = Scene(observation, penalty=Penalty(smoothing=0.1, near_stars=near, exposure=5.0))
+    np.testing.assert_allclose(scene.smoothing_map, (0.1 + near) * 5.0 / 2.0)
+
+
 # --- What a run refuses
 
 REFUSED = [

@@ -245,11 +245,22 @@ def _transmission(field: Field, value: Any, held: Observation) -> Array:
     return values
 
 
+def is_dark(held: Observation) -> bool:
+    """Return whether nothing of the sky is transmitted to images with good pixels."""
+    has_good = ~held.mask.all(axis=(1, 2))
+    return bool(len(held.transmission)) and not held.transmission[has_good].any()
+
+
 def refuse_other_sky(held: Observation) -> None:
-    """Refuse a transmission that is not of the sky's pixels."""
+    """Refuse a transmission that is not of the sky's pixels, or of which no image shows any."""
     shape, sky = held.transmission.shape, held.sky_shape
     if shape[0] and shape[1:] != sky:
         raise InputError(f"`transmission` has shape {shape}; the sky has {sky}")
+    if is_dark(held):
+        raise InputError(
+            "`transmission` is 0 everywhere for the images that have good pixels, so nothing of "
+            "the sky is seen"
+        )
 
 
 # In the order in which they are read: what a field is checked beside is above it.

@@ -90,7 +90,8 @@ class Observation:
     transmission : array_like, shape (p, Ny, Nx) or (Ny, Nx), optional
         Share of the light of each pixel of the sky that each image gets, 0 to 1, before the PSF
         spreads it: that of a coronagraph, or of vignetting on the sky. One serves all images. The
-        sky and the fluxes of stars are those before it. A star behind 0 is left out. What dims the
+        sky and the fluxes of stars are those before it. What is behind less than 0.01 in all images
+        is left out, stars and sky, but for stars with PSFs of their own. What dims the
         light after the PSF, as bad pixels do, is an `exposure`.
     halos : array_like, shape (n, p, ny, nx), (n, 1, ny, nx), (p, ny, nx) or (ny, nx), optional
         Light of known shape and unknown amount, such as the speckles of a star behind a
@@ -197,7 +198,8 @@ class Observation:
         - Images or background exceed 1e30 electrons in a pixel, with exposure and read noise.
         - No good pixel is left, or an offset leaves nothing of an image.
         - A halo is 0 on all good pixels of an image.
-        - `transmission` is not of the sky's shape, out of range, or 0 everywhere.
+        - `transmission` is not of the sky's shape, out of range, or 0 everywhere in the images that
+          have good pixels.
         - A label of `epochs` is missing or not a number, or the labels have no order.
         - `transforms` are given beside `offsets`, shear the images by more than 0.05 pixels, or are
           for pixels smaller than those of the image that the sky is of.

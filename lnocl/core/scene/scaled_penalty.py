@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, NamedTuple
 
-import numpy as np
-
 from lnocl.core.scene.arrays import Array
 from lnocl.core.scene.penalty import MAX_WEIGHT, Penalty
 from lnocl.core.scene.star_prior import StarPrior
@@ -39,7 +37,9 @@ def scaled(penalty: Penalty, scene: Scene) -> Scaled:
     """
     longer = 1.0 if penalty.exposure is None else penalty.exposure / scene.mean_exposure
     smoothing = _scaled("smoothing", penalty.smoothing, longer, scene)
-    smoothing_map, edge = _smoothing_map(penalty, smoothing, scene), 0.0
+    smoothing_map, edge = None, 0.0
+    if penalty.near_stars is not None:
+        smoothing_map = smoothing + longer * enlarged(penalty.near_stars, scene.grid)
     if smoothing > 0 or smoothing_map is not None:
         edge = EDGE * scene.rough_fit.level if penalty.edge is None else penalty.edge / scene.unit
     return Scaled(
@@ -49,13 +49,6 @@ def scaled(penalty: Penalty, scene: Scene) -> Scaled:
         edge,
         penalty.stars and penalty.stars.scaled(scene.unit, scene.scale),
     )
-
-
-def _smoothing_map(penalty: Penalty, smoothing: float, scene: Scene) -> Array | None:
-    """Return the weight of the edge-preserving term on the grid, where it is a map."""
-    if penalty.near_stars is None:
-        return None
-    return np.asarray(smoothing + enlarged(penalty.near_stars, scene.grid))
 
 
 def _scaled(name: str, weight: float, factor: float, scene: Scene) -> float:

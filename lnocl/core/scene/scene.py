@@ -25,7 +25,7 @@ from lnocl.core.scene.scaled_penalty import scaled
 from lnocl.core.scene.scene_check import warn_of_scene
 from lnocl.core.scene.shifting import Cutout, MovablePsf
 from lnocl.core.scene.star_psfs import StarPsfs, owned
-from lnocl.core.scene.star_weights import OBSERVED_SHARE, warn_of_lost_stars, weigh_stars
+from lnocl.core.scene.star_weights import OBSERVED_SHARE, weigh_stars
 from lnocl.core.scene.stars import Covered, StarField, check_positions, covered_box
 from lnocl.core.scene.transforms import enlarged
 from lnocl.errors import InputError
@@ -128,9 +128,8 @@ class Scene:
     Warns
     -----
     LnoclWarning
-        A star that no good pixel shows, in an epoch or at all; a PSF that is larger than the grid,
-        whose wings wrap round; offsets larger than what is unobserved beside the images; a PSF that
-        rings where it is moved between pixels.
+        A PSF that is larger than the grid, whose wings wrap round; offsets larger than what is
+        unobserved beside the images; a PSF that rings where it is moved between pixels.
     """
 
     def __init__(
@@ -587,7 +586,6 @@ class Scene:
         self.shown[: len(is_lost)][is_lost] = False
         self.star_weights[: len(is_lost)][is_lost] = HELD
         self._field = self._place_stars(self.stars)
-        warn_of_lost_stars(self, is_lost)
 
     def _weigh_stars(
         self, field: StarField, owners: NDArray[np.intp]

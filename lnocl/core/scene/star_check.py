@@ -6,11 +6,13 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lnocl.core.scene.arrays import Array
 from lnocl.core.scene.cores import centroid, fwhm
 from lnocl.core.scene.detector import seen_psfs
 from lnocl.core.scene.scene import Scene
+from lnocl.core.scene.star_weights import warn_of_lost_stars
 from lnocl.errors import counted, warn
 
 # The square in which a star is looked at reaches so many widths of its PSF from it, at least and at
@@ -118,7 +120,7 @@ def _masked_stars(scene: Scene) -> Iterator[int]:
             yield s
 
 
-def warn_of_stars(scene: Scene, moves: bool) -> None:
+def warn_of_stars(scene: Scene, moves: bool, own: NDArray[np.intp] | None = None) -> None:
     """Warn of masked stars, of the PSF whose width fits a star least, and of the star farthest off.
 
     Parameters
@@ -127,22 +129,28 @@ def warn_of_stars(scene: Scene, moves: bool) -> None:
         The stars and the images.
     moves : bool
         Whether positions are refined, so that none is off.
+    own : ndarray of int, optional
+        The stars that are looked at, in all epochs: of others a tile sees a part. By default all.
 
     Warns
     -----
     LnoclWarning
-        A star lies on a bad pixel of every image; a PSF is a tenth wider or narrower than a star; a
+        No good pixel shows a star, in an epoch or at all; a star lies on a bad pixel of every image
+        of an epoch; a PSF is a tenth wider or narrower than a star; a
         star lies more than 0.15 pixels, and more than what is beside it explains, from where its
         PSF is.
     """
-    if masked := list(_masked_stars(scene)):
-        x, y = scene.stars[masked[0]]
+    of_places = np.arange(scene.n_stars) // scene.n_epochs
+    is_own = np.ones(scene.n_stars, bool) if own is None else np.isin(of_places, own)
+    warn_of_lost_stars(scene, is_own & ~scene.is_shown[: scene.n_stars])
+    if masked := {of_places[s].item() for s in _masked_stars(scene) if is_own[s]}:
+        x, y = scene.places[min(masked)]
         others = f", as {counted(len(masked) - 1, 'other')}" if len(masked) > 1 else ""
         warn(
             f"the star at ({x:.7g}, {y:.7g}) lies on bad pixels{others}: its flux rests on its "
             "wings, and so on the PSF's; see to the mask"
         )
-    found = list(check_stars(scene))
+    found = [each for each in check_stars(scene) if is_own[each.star]]
     if not found:
         return
     worst = max(found, key=lambda each: abs(np.log(each.widths[0] / each.widths[1])))

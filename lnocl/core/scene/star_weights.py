@@ -71,7 +71,7 @@ def warn_of_lost_stars(scene: Scene, is_lost: NDArray[np.bool_]) -> None:
     if n_dark := int(is_dark.sum()):
         x, y = stars[is_dark][0]
         others = f", and so do {counted(n_dark - 1, 'other')}" if n_dark > 1 else ""
-        or_dark = "" if scene.transmission is None else " or nothing is transmitted"
+        or_dark = "" if scene.transmission is None else f" or not {OBSERVED_SHARE:g} is transmitted"
         warn(
             f"the star at ({x:g}, {y:g}) lies where all images are masked{or_dark}{others}: it "
             "is left out, and its flux is NaN"

@@ -46,8 +46,9 @@ class Light:
         self._scene = scene = estimate.scene
         self._map = Model(scene)
         total = self._map.adjoint(self._map.weights)
-        self._per_weight = np.broadcast_to(1.0 / total[:1, :1], total.shape)
-        if not is_flat(total):
+        if is_flat(total):
+            self._per_weight = np.broadcast_to(1.0 / total[:1, :1], total.shape)
+        else:
             observed = scene.observed(total)
             self._per_weight = np.divide(1.0, total, out=np.zeros(scene.grid), where=observed)
 
