@@ -8,8 +8,7 @@ centre   of a star in noise of 1/100 of its peak, pixels rms in a coordinate: th
 repair   of a block of bad pixels in the core, share of the peak, rms: `lnocl.psf.repair`, and
          astropy.convolution.interpolate_replace_nans with Gaussian kernels of sigma 1 and 2
 shift    by random parts of a pixel, share of the peak, the largest: `lnocl.core.scene.shifting`,
-and
-         scipy.ndimage.shift by splines and fourier_shift
+         and scipy.ndimage.shift by splines and fourier_shift
 rotation by random angles, the same: `lnocl.psf.resampling`, and scipy.ndimage.rotate by splines
 sky      level under a jet and stars, in its standard errors: `lnocl.io.levels`, the sigma-clipped
          median, and estimators of photutils.background

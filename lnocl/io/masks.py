@@ -42,7 +42,7 @@ def mask_of(path: str, word: str) -> tuple[Mask, list[str]]:
     Raises
     ------
     FileError, InputError
-        As `ImageFiles` and `Maps.read`; there is no such extension.
+        The file is refused by `ImageFiles` or `Maps.read`, or has no such extension.
     """
     files = ImageFiles([path], Calibration(mask=[word]))
     return read_mask(files, None)[0], files.maps.sha256.get("mask", [])

@@ -31,7 +31,8 @@ HALO = np.exp(-np.hypot(X - 1, 1.2 * Y) / 4.0)
 KNOWN = {"masked": {"mask": MASK}, "exposures": {"exposure": EXPOSURE, "offsets": OFFSETS},
          "exposure map": {"exposure": MAP}, "epochs": {"epochs": [1, 0]},
          "halos": {"halos": [HALO], "exposure": EXPOSURE},
-         "transmission": {"transmission": np.where(X < 0.0, 0.4, 0.9)}}  # fmt: skip
+         "transmission": {"transmission": np.where(X < 0.0, 0.4, 0.9)},
+         "own PSF": {"star_psfs": 0.3 * PSFS[:, ::-1, :], "star_places": STARS[:1]}}  # fmt: skip
 
 
 pytestmark = pytest.mark.filterwarnings("ignore:the images are shifted")

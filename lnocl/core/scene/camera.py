@@ -2,8 +2,7 @@ r"""Cameras: the maps from the sky's grid to the images, ``A_j = Sample o Turn o
 
 - Transmit: where an image has a transmission, each pixel of the sky is multiplied by its share;
 - Blur: the sky is convolved with the response of image j (`lnocl.core.scene.scene.Scene.psf`), by
-its
-  spectrum, round the edges of the grid;
+  its spectrum, round the edges of the grid;
 - Turn: where images are turned against the sky, three shears (`lnocl.core.scene.rotation`);
 - Sample: an image has each `oversample`-th point of that along both axes.
 

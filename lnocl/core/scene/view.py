@@ -116,7 +116,7 @@ class View:
         scene, window, fluxes = self.scene, self.window, estimate.fluxes
         camera = camera or Camera(scene, self.j)
         image = self.background + camera.part(estimate.sky, window.ranges) / scene.unit
-        # Of images that are turned the grid is no period, so the window is not moved into it.
+        # The window may reach beyond the grid, which is not a period of images that are turned.
         for s in scene.star_field.reaching(self.j, window[:2], window.shape):
             self._add(scene.star_cutout(self.j, s), image, fluxes[s])
         return image
