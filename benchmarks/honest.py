@@ -23,6 +23,7 @@ import numpy as np
 from astropy.table import Table
 
 import lnocl
+from lnocl.psf import make_psf
 
 FWHM = 2.3548
 
@@ -189,6 +190,107 @@ def exact(rng, kind="alone", n=72):
     return Scene(images, psfs, known, stars, fluxes, sky.sum())
 
 
+def zero_points(rng, each_night=False, n=48):
+    """Return six images of four stars, of transparencies .6 to 1.1, of mean 1, not given."""
+    stars = middle(rng, n) + np.array([(0, 0), (-11, 7), (8, 12), (4, -13)])
+    clear, fluxes = rng.permutation(np.linspace(0.6, 1.1, 6)), np.array([3e4, 2e4, 4e4, 1e4])
+    psfs = [psf(31, width, skew=0.1) for width in rng.uniform(3.0, 3.8, 6)]
+    sky = jet(n, 3e4, stars[0])
+    images = [
+        rng.poisson(100 + depth * seen(n, kernel, stars, fluxes, sky))
+        for depth, kernel in zip(clear / clear.mean(), psfs, strict=True)
+    ]
+    known = {"background": 100.0} | ({"epochs": range(6)} if each_night else {})
+    return Scene(images, psfs, known, stars, np.repeat(fluxes, 6 if each_night else 1), 3e4)
+
+
+def epochs(rng, off=(3.0, 0.0), made=None, nights=6, n=64):
+    """Return nights of a star on or off the nucleus of a host, each with a PSF and depth."""
+    star, images, psfs = middle(rng, n), [], []
+    fluxes, depths = 3e4 * rng.uniform(0.8, 1.2, nights), rng.uniform(0.6, 1.4, nights)
+    sky = blob(n, 1e5, star - off, 6.0, 1.4, 1.3)
+    for flux, depth in zip(fluxes, depths, strict=True):
+        true = psf(41, rng.uniform(3.0, 4.2), skew=0.1, stretch=1.1)
+        images.append(rng.poisson(100 + depth * seen(n, true, star, [flux], sky)))
+        psfs.append(true if made is None else made(rng, true))
+    known = {"background": 100.0, "epochs": range(nights), "exposure": depths}
+    return Scene(images, psfs, known, [star], fluxes, 1e5)
+
+
+def of_three_stars(rng, true, flux=1e5, n=120):
+    """Return the PSF that lnocl makes of three stars of a frame."""
+    stars = np.array([(31, 33), (86, 38), (52, 87)]) + rng.uniform(-0.5, 0.5, (3, 2))
+    frame = rng.poisson(100 + seen(n, true, stars, flux * rng.uniform(0.5, 1.5, 3)))
+    return make_psf(frame, stars, size=33).psf
+
+
+def rolls(rng, wrong=1.05, n=44):
+    """Return two turned images of a star of 1e6 on a ring of a fifth of its light."""
+    star, turns = middle(rng, n), [0.0, 40.0]
+    maps = lnocl.rotations(turns, star)
+    true = psf(31, 3.4, 3.5, 0.15)
+    y, x = np.indices((n, n))
+    images = []
+    for to_image in maps:
+        at = np.einsum("ji,jyx->iyx", to_image[:, :2], np.array([x, y]) - star[:, None, None])
+        light = np.exp(-((np.hypot(at[0], at[1] * 1.4) - 10) ** 2) / 8) * (1.5 + np.sign(at[0]))
+        sky = 2e5 * light / light.sum()
+        images.append(rng.poisson(50 + seen(n, true, star, [1e6], sky)))
+    known = {"background": 50.0, "transforms": maps}
+    given = psf(31, 3.4 * wrong, 3.5, 0.15)
+    return Scene(images, given, known, [star], [1e6], 2e5)
+
+
+def tiles(rng, n=96):
+    """Return a field of five stars for tiles, the PSF given of sigma 1.8 for 2."""
+    stars = [rng.uniform(40, 56, 2)]
+    while len(stars) < 5:
+        other = rng.uniform(12, n - 12, 2)
+        if min(np.hypot(*(other - each)) for each in stars) > 16:
+            stars.append(other)
+    fluxes = np.append(2e5, rng.uniform(2e4, 1e5, 4))
+    sky = blob(n, 2e5, (40, 55), 15.0, ratio=1.4)
+    image = rng.poisson(50 + seen(n, psf(25, 2 * FWHM, 0), stars, fluxes, sky))
+    given = psf(25, 1.8 * FWHM, 0)
+    return Scene(image, given, {"background": 50.0}, stars, fluxes, 2e5, tile=80)
+
+
+def coarse(image, q):
+    """Return the sums over q x q pixels."""
+    n = len(image) // q
+    return image.reshape(n, q, n, q).sum(axis=(1, 3))
+
+
+def undersampled(rng, width=1.6, wrong=1.0, p=1, q=2, n=48):
+    """Return dithers of a star of 5e4 on a host of 5e4, the sky q times as fine as they are."""
+    fine, side = 3 * q, 31 * q + 1 - q % 2
+    star, ratio = middle(rng, n), rng.uniform(1.0, 1.5)
+    steps = rng.uniform(-1, 1, (p, 2)) if p > 1 else np.zeros((1, 2))
+    true, images = psf(3 * side, width * fine), []
+    for step in steps:
+        at = fine * (star + step + 0.5) - 0.5
+        sky = blob(n * fine, 5e4, at, 4.0 * fine, 1.0, ratio)
+        images.append(rng.poisson(60 + coarse(seen(n * fine, true, at, [5e4], sky), fine)))
+    given = coarse(psf(3 * side, wrong * width * fine), 3)
+    known = {"background": 60.0, "oversample": q, "offsets": steps}
+    return Scene(images, given, known, [star], [5e4], 5e4)
+
+
+def companion(rng, n=64, flux=1e7):
+    """Return a companion of contrast 1e-3 at 10 pixels, the PSF a star twice as bright."""
+    star, turn = middle(rng, n), rng.uniform(0, 2 * np.pi)
+    stars = [star, star + 10 * np.array([np.cos(turn), np.sin(turn)])]
+    y, x = np.indices((63, 63)) - 31
+    waves = rng.uniform(-0.8, 0.8, (12, 2))
+    speckles = sum(np.sin(a * x + b * y + rng.uniform(0, 6)) for a, b in waves).clip(-3, 3)
+    true = psf(63, 3.4) * (1 + 0.25 * speckles * (1 - np.exp(-((np.hypot(x, y) / 5) ** 4))))
+    true /= true.sum()
+    fluxes = [flux, 1e-3 * flux]
+    image = rng.poisson(100 + seen(n, true, stars, fluxes))
+    given = rng.poisson(100 + 2 * flux * true) - 100.0
+    return Scene(image, given, {"background": 100.0}, stars, fluxes, 0.0, of_interest=slice(1, 2))
+
+
 LINES = {
     "moffat-bright": moffat,
     "moffat-1e6": partial(moffat, sky=1e6),
@@ -205,6 +307,19 @@ LINES = {
     "clipped": saturated,
     "zeroed": partial(saturated, how="zero"),
     "wrapped": partial(saturated, how="wrap"),
+    "zero-points": zero_points,
+    "zero-points-nights": partial(zero_points, each_night=True),
+    "epochs-off-nucleus": epochs,
+    "epochs-on-nucleus": partial(epochs, off=(0.0, 0.0)),
+    "curves-made-psfs": partial(epochs, made=of_three_stars),
+    "rolls-wide": rolls,
+    "rolls-narrow": partial(rolls, wrong=0.95),
+    "tiles": tiles,
+    "undersampled-right": undersampled,
+    "undersampled-wrong": partial(undersampled, wrong=1.04),
+    "dithers": partial(undersampled, width=1.3, p=8),
+    "dithers-coarse": partial(undersampled, width=1.3, p=8, q=1),
+    "companion": companion,
     "exact-alone": exact,
     "exact-jet": partial(exact, kind="jet"),
     "exact-ring": partial(exact, kind="ring"),
