@@ -328,8 +328,8 @@ LINES = {
 
 
 def run(scene):
-    """Return fluxes, extended light, each with its error, kappa, and what is told."""
-    told, nan = [], np.full(len(scene.fluxes), np.nan)
+    """Return the result, fluxes, extended light, each with its error, kappa, and what is told."""
+    result, told, nan = None, [], np.full(len(scene.fluxes), np.nan)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         try:
@@ -346,14 +346,14 @@ def run(scene):
         except lnocl.LnoclError as error:
             found, light, kappa, told = (nan, nan), (np.nan, np.nan), np.nan, [f"refused: {error}"]
     told += [str(each.message) for each in caught]
-    return *found, *light, kappa, list(dict.fromkeys(told))
+    return result, *found, *light, kappa, list(dict.fromkeys(told))
 
 
 def measure(line, seed):
     """Print a run, and yield a row for each flux."""
     scene = LINES[line](np.random.default_rng([seed, zlib.crc32(line.encode())]))
     begun = time.perf_counter()
-    found, errors, light, light_error, kappa, told = run(scene)
+    _, found, errors, light, light_error, kappa, told = run(scene)
     seconds = time.perf_counter() - begun
     fluxes = np.ravel(scene.fluxes).astype(float)[scene.of_interest]
     found, errors = found[scene.of_interest], errors[scene.of_interest]
