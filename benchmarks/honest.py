@@ -204,11 +204,11 @@ def zero_points(rng, each_night=False, n=48):
     return Scene(images, psfs, known, stars, np.repeat(fluxes, 6 if each_night else 1), 3e4)
 
 
-def epochs(rng, off=(3.0, 0.0), made=None, nights=6, n=64):
+def epochs(rng, off=(3.0, -4.0), made=None, nights=6, n=64):
     """Return nights of a star on or off the nucleus of a host, each with a PSF and depth."""
     star, images, psfs = middle(rng, n), [], []
     fluxes, depths = 3e4 * rng.uniform(0.8, 1.2, nights), rng.uniform(0.6, 1.4, nights)
-    sky = blob(n, 1e5, star - off, 6.0, 1.4, 1.3)
+    sky = blob(n, 1e5, star - off, 8.5, ratio=2.0)
     for flux, depth in zip(fluxes, depths, strict=True):
         true = psf(41, rng.uniform(3.0, 4.2), skew=0.1, stretch=1.1)
         images.append(rng.poisson(100 + depth * seen(n, true, star, [flux], sky)))
@@ -261,7 +261,7 @@ def coarse(image, q):
     return image.reshape(n, q, n, q).sum(axis=(1, 3))
 
 
-def undersampled(rng, width=1.6, wrong=1.0, p=1, q=2, n=48):
+def undersampled(rng, width=1.6, wrong=1.0, p=1, q=2, power=1.0, n=48):
     """Return dithers of a star of 5e4 on a host of 5e4, the sky q times as fine as they are."""
     fine, side = 3 * q, 31 * q + 1 - q % 2
     star, ratio = middle(rng, n), rng.uniform(1.0, 1.5)
@@ -269,7 +269,7 @@ def undersampled(rng, width=1.6, wrong=1.0, p=1, q=2, n=48):
     true, images = psf(3 * side, width * fine), []
     for step in steps:
         at = fine * (star + step + 0.5) - 0.5
-        sky = blob(n * fine, 5e4, at, 4.0 * fine, 1.0, ratio)
+        sky = blob(n * fine, 5e4, at, 4.0 * power**2 * fine, power, ratio)
         images.append(rng.poisson(60 + coarse(seen(n * fine, true, at, [5e4], sky), fine)))
     given = coarse(psf(3 * side, wrong * width * fine), 3)
     known = {"background": 60.0, "oversample": q, "offsets": steps}
@@ -317,6 +317,8 @@ LINES = {
     "tiles": tiles,
     "undersampled-right": undersampled,
     "undersampled-wrong": partial(undersampled, wrong=1.04),
+    "cusp-coarse-right": partial(undersampled, q=1, power=0.6),
+    "cusp-coarse-wrong": partial(undersampled, q=1, power=0.6, wrong=1.04),
     "dithers": partial(undersampled, width=1.3, p=8),
     "dithers-coarse": partial(undersampled, width=1.3, p=8, q=1),
     "companion": companion,
