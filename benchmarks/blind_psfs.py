@@ -1,7 +1,7 @@
 """Fluxes of stars and regions in scenes that nothing was tuned on, PSFs right and wrong.
 
     python benchmarks/blind_psfs.py [--scenes FIRST LAST] [--kinds KIND ...] [--psfs PSF ...]
-        [--replicas N] [--output FILE.ecsv]
+        [--replicas N] [--psf-error SHARE] [--output FILE.ecsv]
 
 Scenes 0 to 199 go through eight kinds, eleven PSFs, 1, 4 and 8 images, and four ways:
 
@@ -24,7 +24,7 @@ from functools import partial
 
 import numpy as np
 from astropy.table import Table
-from honest import Scene, coarse, run, seen
+from honest import Scene, coarse, options_of, run, seen
 from regions import CirclePixelRegion, PixCoord
 from scipy.fft import next_fast_len
 from scipy.ndimage import gaussian_filter
@@ -224,11 +224,11 @@ def make_scene(index):
     return scene, of, coarse(unit * sky, fine)
 
 
-def measure(index, replicas):
+def measure(index, replicas, **options):
     """Yield a row for each flux of a scene."""
     scene, of, sky = make_scene(index)
     begun = time.perf_counter()
-    result, found, errors, _, _, kappa, told = run(scene)
+    result, found, errors, _, _, kappa, told = run(scene, **options)
     seconds = time.perf_counter() - begun
     rows = [("star", *each) for each in zip(scene.fluxes, found, errors, strict=True)]
     if replicas and result is not None:
@@ -289,13 +289,14 @@ def main():
     parser.add_argument("--kinds", nargs="+", choices=KINDS, default=KINDS)
     parser.add_argument("--psfs", nargs="+", choices=ERRORS, default=ERRORS)
     parser.add_argument("--replicas", type=int, default=0)
+    parser.add_argument("--psf-error", type=float, help="that of deconvolve, which has to have it")
     parser.add_argument("--output", metavar="FILE.ecsv")
     given = parser.parse_args()
     rows = []
     for index in range(given.scenes[0], given.scenes[1] + 1):
         if KINDS[index % 8] not in given.kinds or ERRORS[index % 11] not in given.psfs:
             continue
-        new = list(measure(index, given.replicas))
+        new = list(measure(index, given.replicas, **options_of(given)))
         for row in new:
             print(*(f"{x:.4g}" if isinstance(x, float) else str(x)[:70] for x in row.values()))
         rows += new

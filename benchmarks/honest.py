@@ -1,6 +1,7 @@
 """Star fluxes in their own stated errors, where PSFs, counts and zero points are not as given.
 
-    python benchmarks/honest.py [LINE ...] [--seeds FIRST LAST] [--output FILE.ecsv]
+    python benchmarks/honest.py [LINE ...] [--seeds FIRST LAST] [--psf-error SHARE]
+        [--output FILE.ecsv]
 
 Backgrounds are right, stars are given where they are unless a line says otherwise, and all else is
 by default. Each run prints the mean flux over the truth, the mean relative error stated, the
@@ -329,7 +330,7 @@ LINES = {
 }
 
 
-def run(scene):
+def run(scene, **options):
     """Return the result, fluxes, extended light, each with its error, kappa, and what is told."""
     result, told, nan = None, [], np.full(len(scene.fluxes), np.nan)
     with warnings.catch_warnings(record=True) as caught:
@@ -337,9 +338,11 @@ def run(scene):
         try:
             observation = lnocl.Observation(scene.images, scene.psfs, **scene.known)
             if scene.tile:
-                result = lnocl.deconvolve_tiles(observation, scene.stars, tile=scene.tile)
+                result = lnocl.deconvolve_tiles(
+                    observation, scene.stars, tile=scene.tile, **options
+                )
             else:
-                result = lnocl.deconvolve(observation, scene.stars)
+                result = lnocl.deconvolve(observation, scene.stars, **options)
             found = np.ravel(result.star_fluxes), np.ravel(result.star_flux_errors)
             light = (np.nan, np.nan) if scene.tile else result.extended_flux
             told = list(result.verdict())
@@ -351,11 +354,11 @@ def run(scene):
     return result, *found, *light, kappa, list(dict.fromkeys(told))
 
 
-def measure(line, seed):
+def measure(line, seed, **options):
     """Print a run, and yield a row for each flux."""
     scene = LINES[line](np.random.default_rng([seed, zlib.crc32(line.encode())]))
     begun = time.perf_counter()
-    _, found, errors, light, light_error, kappa, told = run(scene)
+    _, found, errors, light, light_error, kappa, told = run(scene, **options)
     seconds = time.perf_counter() - begun
     fluxes = np.ravel(scene.fluxes).astype(float)[scene.of_interest]
     found, errors = found[scene.of_interest], errors[scene.of_interest]
@@ -416,6 +419,11 @@ def summarise(table):
     return found
 
 
+def options_of(given):
+    """Return the options of `lnocl.deconvolve` that are given; older versions have none."""
+    return {} if given.psf_error is None else {"psf_error": given.psf_error}
+
+
 def main():
     """Print and write the table."""
     parser = argparse.ArgumentParser(
@@ -423,12 +431,13 @@ def main():
     )
     parser.add_argument("lines", nargs="*", metavar="LINE", help=", ".join(LINES))
     parser.add_argument("--seeds", type=int, nargs=2, default=(0, 4), metavar=("FIRST", "LAST"))
+    parser.add_argument("--psf-error", type=float, help="that of deconvolve, which has to have it")
     parser.add_argument("--output", metavar="FILE.ecsv")
     given = parser.parse_args()
     rows = []
     for line in given.lines or LINES:
         for seed in range(given.seeds[0], given.seeds[1] + 1):
-            rows += measure(line, seed)
+            rows += measure(line, seed, **options_of(given))
             if given.output:
                 Table(rows).write(given.output, overwrite=True)
     summarise(Table(rows)).pprint(max_lines=-1, max_width=-1)
