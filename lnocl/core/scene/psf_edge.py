@@ -21,6 +21,9 @@ CURVATURES = np.append(0.0, np.geomspace(0.005, 0.9, 14))
 LEAST_EXPONENT = 2.4
 # Rings scatter about the best profile by this share of their light, at least.
 SCATTER = 0.003
+# Files hold most of the light of their PSFs: twice this share beyond is as much less likely as its
+# square. Of 67 public PSFs half have 1.8 % or less beyond, and one in ten 4.8 % or more.
+BEYOND = 0.1
 # One PSF in two has a level, with this share of its light (one standard deviation).
 LEVEL = 0.05
 # Beyond the file a profile may go on in another way: one standard deviation of the light there.
@@ -98,7 +101,8 @@ def psf_edge(psf: Array) -> PsfEdge:
 
     for all n and a of a grid, with c and without. Errors are the noise of the pixels, from their
     second differences, and a scatter in proportion to the light, as large as the best fit needs.
-    Light and level are means over the grid, weighted by likelihoods and priors. Radii are in units
+    Light and level are means over the grid, weighted by likelihoods and priors. A halo as flat as a
+    level, such as one of speckles that fill the file, is taken for one. Radii are in units
     of R, so that nothing depends on how finely a PSF is sampled.
 
     Parameters
@@ -279,11 +283,12 @@ def _mean(forms: _Forms, fits: _Fits, level_prior: float, known: Mask) -> PsfEdg
     """Return means over all forms, with a level and without."""
     occam = np.zeros_like(fits.level)
     occam[1] = -0.5 * np.log(fits.level_variance[1] / level_prior**2)
-    logarithm = -0.5 * fits.chi_squared - occam - np.log(forms.slope)
-    weights = np.exp(logarithm - logarithm.max())
-    weights /= weights.sum()
     amplitude, variance = _positive(fits.amplitude, fits.amplitude_variance)
     outside = forms.light_outside(known)
+    rare = np.log1p((amplitude * outside / BEYOND) ** 2)
+    logarithm = -0.5 * fits.chi_squared - occam - np.log(forms.slope) - rare
+    weights = np.exp(logarithm - logarithm.max())
+    weights /= weights.sum()
     light = float((weights * amplitude * outside).sum())
     scatter = weights * ((amplitude * outside - light) ** 2 + variance * outside**2)
     level = float((weights * fits.level).sum())
