@@ -34,7 +34,7 @@ def airy(shape, resolution):
 def test_light_beyond_is_that_of_the_function(shape, beta):
     psf = moffat(shape, beta)
     edge = psf_edge(psf)
-    assert edge.share == pytest.approx(1.0 - psf.sum(), rel=0.2, abs=1e-5)
+    assert edge.share == pytest.approx(1.0 - psf.sum(), rel=0.3, abs=1e-5)
     assert abs(edge.share - (1.0 - psf.sum())) < 2.0 * edge.light_error
     assert abs(edge.level) < 2e-3
 
@@ -47,9 +47,18 @@ def test_a_level_is_told_from_wings(shape, beta, level):
     beyond = 1.0 - psf.sum()
     psf *= (1.0 - level) / psf.sum()
     edge = psf_edge(psf + level / psf.size)
-    assert edge.level == pytest.approx(level, abs=3e-3)
+    assert edge.level == pytest.approx(level, abs=5e-3)
     assert abs(edge.level - level) < 2.0 * edge.level_error
     assert edge.share == pytest.approx(beyond, rel=0.2, abs=1e-5)
+
+
+@pytest.mark.parametrize("width", [45.0, 60.0])
+def test_a_halo_that_is_flat_within_the_file_is_no_level_for_sure(width):
+    """It falls beyond the file, and no file tells it from a level."""
+    shape = 45, 52
+    edge = psf_edge(0.85 * airy(shape, 2.0) + 0.15 * moffat(shape, 2.0, width))
+    assert abs(edge.level) < 2.0 * edge.level_error
+    assert edge.light > 0.03
 
 
 @pytest.mark.parametrize("shape", SHAPES)
@@ -104,7 +113,8 @@ def test_zeros_among_clipped_noise_are_within_the_file():
     noise = np.random.default_rng(5).normal(scale=1e-5, size=(41, 41))
     edge = psf_edge(np.maximum(gaussian((41, 41), 1.5) + noise, 0.0))
     assert edge.known.mean() > 0.97
-    assert edge.level == pytest.approx(1681 * 1e-5 / np.sqrt(2.0 * np.pi), rel=0.1)
+    level = 1681 * 1e-5 / np.sqrt(2.0 * np.pi)
+    assert abs(edge.level - level) < edge.level_error < 0.8 * level
 
 
 @pytest.mark.parametrize("beta", [2.0, 3.0])
@@ -126,7 +136,7 @@ def test_errors_hold_the_truth_of_noisy_psfs(beta):
 def test_what_has_no_rings_tells_nothing():
     point = np.zeros((15, 15))
     point[7, 7] = 3.0
-    for psf in (point, point[7:8, 7:8]):
+    for psf in (point, point[7:8, 7:8], moffat((7, 30), 2.0)):
         edge = psf_edge(psf)
         assert edge.light == edge.light_error == edge.level == edge.level_error == 0.0
-        assert not edge.wing((20, 20)).any()
+        assert not edge.wing((20, 40)).any()

@@ -14,6 +14,8 @@ from lnocl.core.scene.arrays import Array, Mask
 # Rings begin at this share of the way to the nearest edge: the light beyond is told from rings far
 # out, its slope from rings that lie apart. So many rings at most, a pixel wide at least.
 INNERMOST, RINGS, FEWEST = 0.4, 16, 4
+# Smaller files, in pixels from the middle to the nearest edge, have too few rings to tell anything.
+LEAST_RADIUS = 4.0
 # Logarithmic slopes at the edge, and how curved a profile is there: 0 for a power law, 1 for a
 # Gaussian. Flatter profiles are as much more frequent. The light of exponents below 2 is infinite.
 SLOPES = np.geomspace(1.0, 200.0, 120)
@@ -24,10 +26,13 @@ SCATTER = 0.003
 # Files hold most of the light of their PSFs: twice this share beyond is as much less likely as its
 # square. Of 67 public PSFs half have 1.8 % or less beyond, and one in ten 4.8 % or more.
 BEYOND = 0.1
-# One PSF in two has a level, with this share of its light (one standard deviation).
+# One PSF in two has a second component, with this share of its light (one standard deviation): a
+# level, or a halo with one of these slopes within the file and this exponent beyond it.
 LEVEL = 0.05
-# Beyond the file a profile may go on in another way: one standard deviation of the light there.
-ELSEWHERE = 0.1
+HALO_SLOPES, HALO_EXPONENT = (0.5, 1.0, 1.5), 3.5
+# Beyond the file a profile may go on in another way: one standard deviation of the light there, of
+# a halo, which must change its slope, more.
+ELSEWHERE, HALO_ELSEWHERE = 0.1, 0.5
 # A wing of another form than those fitted is taken for a level of this share of the light beyond.
 WING_AS_LEVEL = 0.03
 # Profiles are tabulated in so many steps of the radius.
@@ -39,7 +44,7 @@ class PsfEdge(NamedTuple):
 
     The light beyond has the profile, R the radius of the largest circle within the file,
 
-    .. math:: A \left(\frac{r^2 + a^2}{R^2 + a^2}\right)^{-n / 2}
+    .. math:: A \left(\frac{r^2 + a^2}{R^2 + a^2}\right)^{-n / 2} + H (r / R)^{-3.5}
 
     Attributes
     ----------
@@ -48,8 +53,8 @@ class PsfEdge(NamedTuple):
     level, level_error : float
         Sum over the file of what all its pixels have alike, and its standard error: positive for a
         background that was not subtracted, negative for one of which too much was.
-    amplitude : float
-        A, the light in a pixel at R.
+    amplitude, halo : float
+        A and H, light in a pixel at R.
     exponent, core, radius : float
         n, without a unit; a and R, pixels of the PSF.
     known : ndarray of bool, shape (ky, kx)
@@ -61,6 +66,7 @@ class PsfEdge(NamedTuple):
     level: float
     level_error: float
     amplitude: float
+    halo: float
     exponent: float
     core: float
     radius: float
@@ -86,9 +92,10 @@ class PsfEdge(NamedTuple):
         """
         outside = ~_placed(self.known, shape)
         wing = np.zeros(shape)
-        squares = _radii(shape)[outside] ** 2 + self.core**2
-        edge = self.radius**2 + self.core**2
-        wing[outside] = self.amplitude * (squares / edge) ** (-0.5 * self.exponent)
+        r = _radii(shape)[outside]
+        squares = (r**2 + self.core**2) / (self.radius**2 + self.core**2)
+        wing[outside] = self.amplitude * squares ** (-0.5 * self.exponent)
+        wing[outside] += self.halo * (r / self.radius) ** -HALO_EXPONENT
         return wing
 
 
@@ -97,13 +104,15 @@ def psf_edge(psf: Array) -> PsfEdge:
 
     The means of its rings from 0.4 R outwards are fitted by
 
-    .. math:: A \left(\frac{r^2 + a^2}{R^2 + a^2}\right)^{-n / 2} + c, \qquad A > 0, n \ge 2.4
+    .. math:: A \left(\frac{r^2 + a^2}{R^2 + a^2}\right)^{-n / 2} + c (r / R)^{-t},
+              \qquad A > 0, n \ge 2.4
 
-    for all n and a of a grid, with c and without. Errors are the noise of the pixels, from their
-    second differences, and a scatter in proportion to the light, as large as the best fit needs.
-    Light and level are means over the grid, weighted by likelihoods and priors. A halo as flat as a
-    level, such as one of speckles that fill the file, is taken for one. Radii are in units
-    of R, so that nothing depends on how finely a PSF is sampled.
+    for all n and a of a grid, without c and with t of 0, 0.5, 1 and 1.5: a level has t = 0, and the
+    others are halos, which are positive and go on beyond the file. Errors are the noise of the
+    pixels, from their second differences, and a scatter in proportion to the light, as large as the
+    best fit needs. Light and level are means over all, weighted by likelihoods and priors, so that
+    a profile that may be either gives both large errors. Radii are in units of R, so that nothing
+    depends on how finely a PSF is sampled.
 
     Parameters
     ----------
@@ -114,7 +123,7 @@ def psf_edge(psf: Array) -> PsfEdge:
     Returns
     -------
     PsfEdge
-        Zeros where the file has but one pixel, which has no rings.
+        Zeros where an edge is less than 4 pixels from the middle, which tells nothing.
 
     Examples
     --------
@@ -130,12 +139,11 @@ def psf_edge(psf: Array) -> PsfEdge:
     psf = psf / psf.sum()
     known, r = _known(psf), _radii(psf.shape)
     radius, furthest = _reach(known), float(r[known].max())
-    if not furthest:
-        return PsfEdge(0.0, 0.0, 0.0, 0.0, 0.0, LEAST_EXPONENT, 0.0, radius, known)
+    if radius < LEAST_RADIUS:
+        return PsfEdge(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, LEAST_EXPONENT, 0.0, radius, known)
     chosen = known & (r >= INNERMOST * radius)
     forms = _Forms(radius, furthest)
-    rings, level_prior = _Rings(psf, r, chosen, forms), LEVEL / int(known.sum())
-    return _mean(forms, _settled(rings, level_prior), level_prior, known)
+    return _mean(forms, _settled(_Rings(psf, r, chosen, forms), known, r), known)
 
 
 def _radii(shape: tuple[int, ...]) -> Array:
@@ -203,8 +211,8 @@ class _Forms:
         """Return where radii are in the table."""
         return np.rint(r / self.step).astype(np.intp)
 
-    def light_outside(self, known: Mask) -> Array:
-        """Return the light of each form in all pixels that are not known."""
+    def light_outside(self, known: Mask) -> tuple[Array, float]:
+        """Return the light in all pixels that are not known, of each form and of a halo."""
         half = int(np.ceil(self.furthest))
         r = _radii((2 * half + 1, 2 * half + 1))
         missing = r[~_placed(known, r.shape) & (r <= self.furthest)]
@@ -212,7 +220,10 @@ class _Forms:
         ratio = self._over_edge(self.furthest)[:, 0]
         squares = self.furthest**2 + self.core**2
         far = 2.0 * np.pi / (self.exponent - 2.0) * squares * ratio ** (-0.5 * self.exponent)
-        return np.asarray(near + far)
+        reach = self.furthest / self.radius
+        halo = ((missing / self.radius) ** -HALO_EXPONENT).sum()
+        halo += 2.0 * np.pi / (HALO_EXPONENT - 2.0) * self.radius**2 * reach ** (2 - HALO_EXPONENT)
+        return np.asarray(near + far), float(halo)
 
 
 class _Rings:
@@ -227,8 +238,11 @@ class _Rings:
         counts = np.bincount(places, minlength=size).reshape(n, -1)
         pixels = counts.sum(axis=1)
         used = pixels > 0
+        at = forms.step * np.maximum(np.arange(STEPS + 1), 1) / forms.radius
+        shares = counts[used] / pixels[used, None]
+        self.halos = [shares @ at**-slope for slope in (0.0, *HALO_SLOPES)]
         self.means = (np.bincount(number, psf[chosen], n)[used]) / pixels[used]
-        self.forms = forms.table @ (counts[used] / pixels[used, None]).T
+        self.forms = forms.table @ shares.T
         # Where a profile rises and falls, as that of a pupil does, its envelope tells the scatter.
         envelope = np.maximum.accumulate(abs(self.means)[::-1])[::-1]
         self.variances = _noise(psf, chosen) ** 2 / pixels[used] + (SCATTER * envelope) ** 2
@@ -246,60 +260,78 @@ def _noise(psf: Array, chosen: Mask) -> float:
 
 
 class _Fits(NamedTuple):
-    """Amplitudes and levels of each form, without a level and with one: arrays (2, n)."""
+    """Fits of each form, without a second component and with each: arrays (1 + components, n)."""
 
-    chi_squared: Array
+    cost: Array
     amplitude: Array
     amplitude_variance: Array
-    level: Array
-    level_variance: Array
+    second: Array
+    second_variance: Array
 
 
-def _fits(rings: _Rings, level_prior: float) -> _Fits:
-    """Return the best amplitudes and levels of all forms, from the normal equations."""
+def _fits(rings: _Rings, priors: Array) -> _Fits:
+    """Return the best amplitudes of all forms, from the normal equations.
+
+    The cost has half of chi squared, and the share of its prior that a component leaves open.
+    """
     w, m = 1.0 / rings.variances, rings.means
-    aa, al, am = rings.forms**2 @ w, rings.forms @ w, rings.forms @ (w * m)
-    ll, lm, mm = w.sum() + level_prior**-2, (w * m).sum(), (w * m * m).sum()
-    determinant = aa * ll - al**2
-    amplitude = np.stack([am / aa, (am * ll - lm * al) / determinant])
-    level = np.stack([0.0 * aa, (lm * aa - am * al) / determinant])
-    return _Fits(
-        mm - amplitude * am - level * lm,
-        amplitude,
-        np.stack([1.0 / aa, ll / determinant]),
-        level,
-        np.stack([0.0 * aa, aa / determinant]),
-    )
+    aa, am, mm = rings.forms**2 @ w, rings.forms @ (w * m), (w * m * m).sum()
+    none, best = np.zeros_like(aa), am / aa
+    rows = [(0.5 * (mm - best * am), best, 1.0 / aa, none, none)]
+    for halo, prior in zip(rings.halos, priors, strict=True):
+        al, ll, lm = rings.forms @ (w * halo), halo**2 @ w + prior**-2, halo @ (w * m)
+        determinant = aa * ll - al**2
+        first, second = (am * ll - lm * al) / determinant, (lm * aa - am * al) / determinant
+        variance = aa / determinant
+        cost = 0.5 * (mm - first * am - second * lm) + 0.5 * np.log(prior**2 / variance)
+        cost += np.log(1.0 if not rows[1:] else len(priors) - 1.0)
+        rows.append((cost, first, ll / determinant, second, variance))
+    return _Fits(*(np.stack(each) for each in zip(*rows, strict=True)))
 
 
-def _settled(rings: _Rings, level_prior: float) -> _Fits:
+def _settled(rings: _Rings, known: Mask, r: Array) -> _Fits:
     """Return fits with variances as large as the best of them needs."""
-    best = float(_fits(rings, level_prior).chi_squared.min())
-    rings.variances *= max(1.0, best / max(len(rings.means) - FEWEST, 1))
-    return _fits(rings, level_prior)
+    within = np.maximum(r[known], 1.0) / r[known].max()
+    priors = LEVEL / np.array([(within**-slope).sum() for slope in (0, *HALO_SLOPES)])
+    w, m = 1.0 / rings.variances, rings.means
+    fits = _fits(rings, priors)
+    left = m - fits.amplitude[..., None] * rings.forms
+    seconds = np.stack([np.zeros_like(m), *rings.halos])
+    left -= fits.second[..., None] * seconds[:, None]
+    best = float((left**2 @ w).min())
+    rings.variances *= max(1.0, best / max(len(m) - FEWEST, 1))
+    return _fits(rings, priors)
 
 
-def _mean(forms: _Forms, fits: _Fits, level_prior: float, known: Mask) -> PsfEdge:
-    """Return means over all forms, with a level and without."""
-    occam = np.zeros_like(fits.level)
-    occam[1] = -0.5 * np.log(fits.level_variance[1] / level_prior**2)
-    amplitude, variance = _positive(fits.amplitude, fits.amplitude_variance)
-    outside = forms.light_outside(known)
-    rare = np.log1p((amplitude * outside / BEYOND) ** 2)
-    logarithm = -0.5 * fits.chi_squared - occam - np.log(forms.slope) - rare
+def _mean(forms: _Forms, fits: _Fits, known: Mask) -> PsfEdge:
+    """Return means over all fits."""
+    first, variance = _positive(fits.amplitude, fits.amplitude_variance)
+    second, second_variance = fits.second.copy(), fits.second_variance.copy()
+    second[2:], second_variance[2:] = _positive(second[2:], second_variance[2:])
+    outside, beyond = forms.light_outside(known)
+    light, halo = first * outside, beyond * second
+    halo[:2] = 0.0
+    rare = np.log1p(((light + halo) / BEYOND) ** 2)
+    logarithm = -fits.cost - np.log(forms.slope) - rare
+    logarithm[2:] += log_ndtr(fits.second[2:] / np.sqrt(fits.second_variance[2:]))
     weights = np.exp(logarithm - logarithm.max())
     weights /= weights.sum()
-    light = float((weights * amplitude * outside).sum())
-    scatter = weights * ((amplitude * outside - light) ** 2 + variance * outside**2)
-    level = float((weights * fits.level).sum())
-    spread = weights * ((fits.level - level) ** 2 + fits.level_variance)
-    best, n = int(np.argmax(weights.sum(axis=0))), int(known.sum())
+
+    mean, halo_mean = float((weights * light).sum()), float((weights * halo).sum())
+    spread = (light + halo - mean - halo_mean) ** 2 + variance * outside**2
+    spread[2:] += second_variance[2:] * beyond**2 + (HALO_ELSEWHERE * halo[2:]) ** 2
+    levels, n = second[1] * int(known.sum()), int(known.sum())
+    level = float((weights[1] * levels).sum())
+    level_spread = (weights[1] * ((levels - level) ** 2 + n**2 * second_variance[1])).sum()
+    level_spread += (1.0 - weights[1].sum()) * level**2
+    best = int(np.argmax(weights.sum(axis=0)))
     return PsfEdge(
-        light,
-        float(np.hypot(np.sqrt(scatter.sum()), ELSEWHERE * light)),
-        n * level,
-        float(np.hypot(n * np.sqrt(spread.sum()), WING_AS_LEVEL * light)),
-        light / float(outside[best]),
+        mean + halo_mean,
+        float(np.hypot(np.sqrt((weights * spread).sum()), ELSEWHERE * mean)),
+        level,
+        float(np.hypot(np.sqrt(level_spread), WING_AS_LEVEL * (mean + halo_mean))),
+        mean / float(outside[best]),
+        halo_mean / beyond,
         float(forms.exponent[best]),
         float(forms.core[best]),
         forms.radius,
