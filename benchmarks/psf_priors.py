@@ -5,6 +5,7 @@
         [--saturation V] [--most N] [--kind KIND] --output FILE.ecsv
     python benchmarks/psf_priors.py --report FILE.ecsv ... [--held-out NAME ...]
     python benchmarks/psf_priors.py --exposures CUBE POSITIONS CUBE POSITIONS [--half R]
+    python benchmarks/psf_priors.py --edges PSF.fits ...
 
 An image is a frame, or a cube of stamps with one star in the middle of each. Positions are lines of
 x and y, pixels from 0; without them stars are found by photutils, those alone within the window.
@@ -25,6 +26,9 @@ window: a pedestal of the PSF, or light that it does not have, over the star's.
 
 --exposures compares light within R pixels of the same stars in two exposures: the zero point
 between them, and the scatter of the stars about it.
+
+--edges prints what `lnocl.core.scene.psf_edge` tells of PSFs, and of parts of them, beside the
+light that is beyond a part and within the whole.
 
 The report has for each set the mean and the scatter of each parameter beyond its errors, by maximum
 likelihood, and then a prior: a normal distribution of mean 0 whose width the sets not held out
@@ -50,6 +54,7 @@ from lnocl.errors import InputError
 from lnocl.psf import make_psf
 
 SMOOTHED, ALIEN, FAR, FIELD, LEAST = 2.0, 5.0, 2.5, 0.02, 15.0
+PARTS = 0.25, 0.4, 0.6, 0.8
 PARAMETERS = "width", "stretch", "blur_xx", "blur_xy", "blur_yy"
 FIELDS = "field", "field_core", "field_plain"
 
@@ -311,6 +316,35 @@ def zero_point(cubes, positions, radius):
     print(f"stars about it, the brighter half: {100 * mad_std(found):.2f} %")
 
 
+def edges(paths):
+    """Print light beyond PSFs and levels in them, and how these hold for parts of known wholes."""
+    pulls = []
+    for path in paths:
+        psf = np.array(fits.getdata(path), float)
+        edge = psf_edge(psf)
+        print(
+            f"{path.name}: beyond {100 * edge.share:.2f} +- {100 * edge.light_error:.2f} %, "
+            f"level {100 * edge.level:.2f} +- {100 * edge.level_error:.2f} %"
+        )
+        y, x = (n // 2 + round(by) for n, by in zip(psf.shape, off_centre(psf)[::-1], strict=True))
+        most = min(y, x, psf.shape[0] - 1 - y, psf.shape[1] - 1 - x)
+        whole = psf[y - most : y + most + 1, x - most : x + most + 1]
+        for half in (int(share * most) for share in PARTS):
+            part = psf[y - half : y + half + 1, x - half : x + half + 1]
+            edge = psf_edge(part)
+            if not edge.light:
+                continue
+            found, true = edge.wing(whole.shape).sum(), whole.sum() / part.sum() - 1.0
+            error = edge.light_error * found / edge.light
+            pulls.append((found - true) / error)
+            print(
+                f"  {part.shape}: {100 * found:.2f} +- {100 * error:.2f} %, true "
+                f"{100 * true:.2f}; level {100 * edge.level:.2f} +- {100 * edge.level_error:.2f} %"
+            )
+    words = f"{np.median(np.abs(pulls)):.2f}, rms {np.sqrt(np.mean(np.square(pulls))):.2f}"
+    print(f"{len(pulls)} parts: error over that stated {words}")
+
+
 def level_slope(table):
     """Return light in a level over a star's, and its error, from the stars of a set."""
     if len(table) < 4:
@@ -385,7 +419,11 @@ def main():
     parser.add_argument("--report", nargs="+", type=Path)
     parser.add_argument("--held-out", nargs="*", default=())
     parser.add_argument("--exposures", nargs=4, type=Path)
+    parser.add_argument("--edges", nargs="+", type=Path)
     options = parser.parse_args()
+    if options.edges:
+        edges(options.edges)
+        return
     if options.exposures:
         zero_point(options.exposures[::2], options.exposures[1::2], options.half)
         return

@@ -24,7 +24,7 @@ LEAST_EXPONENT = 2.4
 # Rings scatter about the best profile by this share of their light, at least.
 SCATTER = 0.003
 # Files hold most of the light of their PSFs: twice this share beyond is as much less likely as its
-# square. Of 67 public PSFs half have 1.8 % or less beyond, and one in ten 4.8 % or more.
+# square. Of 67 public PSFs half have 1.7 % or less beyond, and one in ten 4.1 % or more.
 BEYOND = 0.1
 # One PSF in two has a second component, with this share of its light (one standard deviation): a
 # level, or a halo with one of these slopes within the file and this exponent beyond it.
