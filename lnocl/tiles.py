@@ -36,6 +36,7 @@ from lnocl.tiling import Span, Tile, cut, lay
 
 # Of those of `lnocl.deconvolve`, beside parameters.
 OPTIONS = {"solver", "precision", "engine", "device", "pad", "refine_positions", "refine_psfs"}
+OPTIONS |= {"mend_images"}
 # The tiles with the brightest extended source, of whose choices that in the middle is taken.
 N_CHOOSING = 3
 # Warnings of tiles that are given in full.
@@ -173,7 +174,7 @@ def deconvolve_tiles(
         Show progress, as `lnocl.deconvolve` does.
     **options
         Others of `lnocl.deconvolve`: solver, precision, engine, device, pad, refine_positions,
-        refine_psfs.
+        refine_psfs, mend_images.
 
     Returns
     -------
@@ -261,7 +262,7 @@ def deconvolve_tiles(
     if isinstance(prepared.stop, str):
         chosen = _choose(observed, parallel, replace(prepared, fits=False))
         prepared = _ending(prepared, chosen)
-    mosaic = _Mosaic(observation, positions, plan, tiles[0])
+    mosaic = _Mosaic(observation, positions, replace(plan, found=prepared.found), tiles[0])
     with (
         Progress(len(observed), "tile", progress, "deconvolving") as bar,
         closing(work(partial(partial, _solve, prepared), observed, parallel)) as answers,

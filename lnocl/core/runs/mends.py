@@ -1,0 +1,54 @@
+"""What is mended of images before anything is fitted to them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from lnocl.core.runs.start import Setup
+from lnocl.core.scene.arrays import Mask
+from lnocl.core.scene.penalty import Penalty
+from lnocl.errors import counted, note
+from lnocl.process import ignored_notes, ignored_warnings
+
+# Places that a line names.
+MOST_NAMED = 3
+
+
+def mask_cores(setup: Setup) -> tuple[Setup, str]:
+    """Return a setup with cores of stars masked that images have lost, and that in words.
+
+    `lnocl.core.scene.saturation` says which these are.
+    """
+    from lnocl.core.scene.saturation import lost_cores
+
+    with ignored_warnings(), ignored_notes():  # the run has them too
+        scene = setup.scene(Penalty())
+    lost, named = np.zeros(setup.observation.mask.shape, bool), []
+    for each in lost_cores(scene):
+        lost[each.image, each.rows, each.columns] |= each.lost
+        x, y = scene.stars[each.star]
+        is_flat = np.isfinite(each.level)
+        why = f"flat at {each.level:.6g} electrons" if is_flat else "far below what is beside them"
+        pixels = counted(int(each.lost.sum()), "pixel")
+        named.append(f"{pixels} of `images[{each.image}]` at ({x:.7g}, {y:.7g}), {why}")
+    return _masked(setup, lost, named, "saturated")
+
+
+def _masked(setup: Setup, bad: Mask, named: Sequence[str], what: str) -> tuple[Setup, str]:
+    """Return a setup with more pixels masked, and in words which; say so where there are any."""
+    if not bad.any():
+        return setup, ""
+    observation = setup.observation
+    words = _first(named)
+    note(f"{what} pixels masked: {words} (`mend_images` False leaves them)")
+    return replace(setup, observation=observation.replace(mask=observation.mask | bad)), words
+
+
+def _first(named: Sequence[str]) -> str:
+    """Return the first of what is named, and the number of others."""
+    more = len(named) - MOST_NAMED
+    others = [f"and {counted(more, 'other')}"] if more > 0 else []
+    return "; ".join([*named[:MOST_NAMED], *others])
