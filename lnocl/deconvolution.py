@@ -177,10 +177,13 @@ def deconvolve(
         The extended source is marginalised. An empty sequence is for none. See Notes. At least one
         star.
     mend_images : bool, optional
-        Mask saturated cores of stars, where `smoothing` is "auto".
+        Mask saturated cores of stars, and fit relative exposures to stars, where `smoothing` is
+        "auto".
 
-        Cores are flat at their top, 0, or wrapped round (`lnocl.core.scene.saturation`). A line of
-        the log and the plan of the result say what was mended.
+        Cores are flat at their top, 0, or wrapped round (`lnocl.core.scene.saturation`). Exposures
+        of several images of one epoch are multiplied by the factor that all stars show, where it is
+        significant (`lnocl.core.scene.zero_points`); the image in the middle keeps its own. A line
+        of the log and the plan of the result say what was mended.
     checkpoint : str or path, optional
         File for the state of the run (FITS), saved after the first iteration, every minute and at
         the end.

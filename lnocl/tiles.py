@@ -392,6 +392,7 @@ class _Mosaic:
     def __init__(
         self, observation: Observation, positions: Array, plan: Plan, spans: tuple[Span, Span]
     ) -> None:
+        self.setup = plan.setup
         self.plan, n_epochs = tuple(str(plan).splitlines()), observation.n_epochs
         self.observation = observation
         self.given_positions = np.repeat(positions, n_epochs, axis=0)

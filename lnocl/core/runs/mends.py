@@ -37,6 +37,30 @@ def mask_cores(setup: Setup) -> tuple[Setup, str]:
     return _masked(setup, lost, named, "saturated")
 
 
+def fit_exposures(setup: Setup) -> tuple[Setup, str]:
+    """Return a setup with exposures times the zero points that stars tell, and these in words.
+
+    `lnocl.core.scene.zero_points` says which these are.
+    """
+    from lnocl.core.scene.zero_points import zero_points
+
+    with ignored_warnings(), ignored_notes():
+        found = zero_points(setup.scene(Penalty()))
+    if found is None:
+        return setup, ""
+    factors, observation = np.exp(found.values), setup.observation
+    each = factors if observation.exposure.ndim == 1 else factors[:, None, None]
+    words = "; ".join(
+        f"`images[{j}]` {factor:.3f} +- {factor * error:.1g}"
+        for j, (factor, error) in enumerate(zip(factors, found.errors, strict=True))
+        if factor != 1.0
+    )
+    words = f"times {words}, by {counted(found.n_stars, 'star')}"
+    note(f"exposures fitted: {words} (`mend_images` False leaves them)")
+    changed = observation.replace(exposure=observation.exposure * each)
+    return replace(setup, observation=changed, in_time=setup.is_rate), words
+
+
 def _masked(setup: Setup, bad: Mask, named: Sequence[str], what: str) -> tuple[Setup, str]:
     """Return a setup with more pixels masked, and in words which; say so where there are any."""
     if not bad.any():

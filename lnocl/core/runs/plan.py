@@ -27,8 +27,9 @@ from lnocl.core.scene.star_psfs import owned, refuse_unowned
 from lnocl.core.scene.stars import check_positions
 from lnocl.core.solvers import SolverName
 
-CORES, LEVELS, PSFS, HALOS, PRIOR, CHOICE, STARS = STEPS = (
+CORES, EXPOSURES, LEVELS, PSFS, HALOS, PRIOR, CHOICE, STARS = STEPS = (
     "mask saturated cores",
+    "fit exposures to stars",
     "fit levels of backgrounds",
     "judge PSFs before the run",
     "settle halos",
@@ -56,6 +57,10 @@ class Condition(NamedTuple):
 AUTO = Condition(lambda plan: plan.smoothing == "auto", "`smoothing` is a number")
 MENDS = Condition(lambda plan: plan.mends, "`mend_images` is False")
 HAS_STARS = Condition(lambda plan: len(plan.setup.stars) > 0, "there are no stars")
+SEVERAL = Condition(lambda plan: plan.setup.observation.n_images > 1, "there is one image")
+ONE_EPOCH = Condition(
+    lambda plan: plan.setup.observation.n_epochs == 1, "stars may vary from epoch to epoch"
+)
 SHOWS_PSFS = Condition(
     lambda plan: bool((owned(plan.setup.observation, plan.setup.stars) < 0).any()),
     "all stars have PSFs of their own",
@@ -70,6 +75,7 @@ WHOLE = Condition(lambda plan: not plan.in_tiles, "the images are divided into t
 # What each step needs, in the order in which reasons are given.
 NEEDS: dict[str, tuple[Condition, ...]] = {
     CORES: (AUTO, MENDS, HAS_STARS),
+    EXPOSURES: (AUTO, MENDS, HAS_STARS, SEVERAL, ONE_EPOCH),
     LEVELS: (AUTO, HAS_ERROR, WHOLE),
     PSFS: (AUTO, HAS_STARS, SHOWS_PSFS),
     HALOS: (AUTO, HAS_HALOS),
@@ -127,6 +133,7 @@ class Plan:
     >>> obs = lnocl.Observation(np.stack([image] * 2), np.ones((3, 3)), epochs=[0, 1])
     >>> print(lnocl.plan(obs, [(8, 5)]))
     mask saturated cores: yes
+    fit exposures to stars: no, stars may vary from epoch to epoch
     fit levels of backgrounds: no, backgrounds have no error
     judge PSFs before the run: yes, and fit shift, jitter, pixels
     settle halos: no, there are no halos
