@@ -177,10 +177,11 @@ def deconvolve(
         The extended source is marginalised. An empty sequence is for none. See Notes. At least one
         star.
     mend_images : bool, optional
-        Mask saturated cores of stars, and fit relative exposures to stars, where `smoothing` is
-        "auto".
+        Mask saturated cores of stars and cosmic rays, and fit relative exposures to stars, where
+        `smoothing` is "auto".
 
-        Cores are flat at their top, 0, or wrapped round (`lnocl.core.scene.saturation`). Exposures
+        Cores are flat at their top, 0, or wrapped round (`lnocl.core.scene.saturation`). Cosmic
+        rays are sharper than the PSF (`lnocl.core.scene.blemishes`). Exposures
         of several images of one epoch are multiplied by the factor that all stars show, where it is
         significant (`lnocl.core.scene.zero_points`); the image in the middle keeps its own. A line
         of the log and the plan of the result say what was mended.

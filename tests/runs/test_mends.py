@@ -5,7 +5,7 @@ import pytest
 from astropy.io import fits
 
 import lnocl
-from lnocl.core.runs.plan import CORES, EXPOSURES
+from lnocl.core.runs.plan import CORES, EXPOSURES, RAYS
 from lnocl.core.runs.preparation import prepare
 from lnocl.result.kept import from_parts, to_parts
 
@@ -88,3 +88,45 @@ class TestExposures:
         np.testing.assert_array_equal(again.observation.exposure, outcome.observation.exposure)
         assert outcome.observation.exposure[0] < 1.5
         assert (again.setup.is_rate, outcome.setup.is_rate) == (True, True)
+
+
+class TestRays:
+    def image(self):
+        """Return counts of a star, and the same with a track beside it."""
+        light = LEVEL + 3e4 * lopsided(*STAR, SIZE) / lopsided(20, 20, 41).sum()
+        image = np.random.default_rng(6).poisson(light).astype(float)
+        rays = np.zeros_like(image)
+        rays[26, 22:25] = 4e3, 9e3, 2e3
+        return image, rays
+
+    @pytest.mark.parametrize("oversample", [1, 2])
+    def test_they_are_masked_and_told_image_by_image(self, oversample):
+        image, rays = self.image()
+        psf = PSF if oversample == 1 else np.repeat(np.repeat(PSF, 2, 0), 2, 1)
+        given = lnocl.Observation([image, image + rays], psf, background=LEVEL,
+                                  oversample=oversample)  # fmt: skip
+        prepared = prepare(lnocl.plan(given, refine_psfs=()))
+        mask = prepared.setup.observation.mask
+        assert mask[1][rays > 0].all()
+        assert not mask[0].any()
+        assert prepared.found[RAYS] == f"{mask.sum()} pixels of `images[1]`"
+
+    def test_the_star_has_its_flux(self):
+        image, rays = self.image()
+        given = lnocl.Observation(image + rays, PSF, background=LEVEL)
+        result = lnocl.deconvolve(given, [STAR], engine="numpy", n_iter=300)
+        (flux,), (error,) = result.star_fluxes, result.star_flux_errors
+        assert abs(flux - 3e4) < 3.0 * error < 1e3
+        assert result.verdict() == ["the model fits"]
+
+    def test_stars_sharper_than_a_wrong_psf_are_none(self):
+        image, _ = self.image()
+        y, x = np.indices((41, 41)) - 20
+        given = lnocl.Observation(image, np.exp(-(x**2 + y**2) / 1e3), background=LEVEL)
+        assert not prepare(lnocl.plan(given, [STAR], refine_psfs=())).found[RAYS]
+
+    def test_noise_beyond_that_of_counts_is_none(self):
+        """As in images whose unit is not electrons."""
+        counts = np.random.default_rng(3).normal(LEVEL, 5.0 * LEVEL**0.5, (64, 64))
+        given = lnocl.Observation(counts.clip(0.0), PSF, background=LEVEL)
+        assert not prepare(lnocl.plan(given)).setup.observation.mask.any()

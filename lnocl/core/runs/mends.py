@@ -6,15 +6,21 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+from scipy.ndimage import binary_dilation
 
 from lnocl.core.runs.start import Setup
-from lnocl.core.scene.arrays import Mask
+from lnocl.core.scene.arrays import Array, Mask
+from lnocl.core.scene.detector import seen_psfs
+from lnocl.core.scene.noise_check import measure_noise
+from lnocl.core.scene.observation import Observation
 from lnocl.core.scene.penalty import Penalty
 from lnocl.errors import counted, note
 from lnocl.process import ignored_notes, ignored_warnings
 
 # Places that a line names.
 MOST_NAMED = 3
+# Electrons per pixel that noise is of at least, and the share of stars that may be sharp.
+LEAST, MOST_STARS = 1e-3, 0.5
 
 
 def mask_cores(setup: Setup) -> tuple[Setup, str]:
@@ -35,6 +41,48 @@ def mask_cores(setup: Setup) -> tuple[Setup, str]:
         pixels = counted(int(each.lost.sum()), "pixel")
         named.append(f"{pixels} of `images[{each.image}]` at ({x:.7g}, {y:.7g}), {why}")
     return _masked(setup, lost, named, "saturated")
+
+
+def mask_rays(setup: Setup) -> tuple[Setup, str]:
+    """Return a setup with pixels masked that are sharper than their PSF, and that in words.
+
+    `lnocl.core.scene.blemishes.cosmic_rays` says which these are. Noise is that of the counts, or
+    as much more as the dark parts of an image have. A star is taken for none; where most stars
+    would be, the PSF is wrong and nothing is masked.
+    """
+    from lnocl.core.scene.blemishes import cosmic_rays
+
+    observation = setup.observation
+    rays, named = np.zeros(observation.mask.shape, bool), []
+    measured = zip(measure_noise(observation), _psfs_of(observation), strict=True)
+    for j, (noise, psfs) in enumerate(measured):
+        counts, mask, background = (
+            each[j] for each in (observation.images, observation.mask, observation.background)
+        )
+        factor = 1.0 if noise is None else max(np.exp(noise.log_factor()), 1.0)
+        error = np.sqrt(factor * np.maximum(counts, np.maximum(background, LEAST)))
+        found = cosmic_rays(np.where(mask, 0.0, counts - background), error, mask, psfs, True)
+        stars = np.round(observation.places(j, setup.stars)).astype(int)
+        at_stars = stars[np.all((stars >= 0) & (stars < observation.shape[::-1]), axis=1)]
+        near = np.zeros(mask.shape, bool)
+        near[at_stars[:, 1], at_stars[:, 0]] = True
+        is_ray = found[near]
+        if found.any() and not (len(is_ray) and is_ray.mean() > MOST_STARS):
+            rays[j] = found & ~binary_dilation(near, np.ones((3, 3)))
+            if n := int(rays[j].sum()):
+                named.append(f"{counted(n, 'pixel')} of `images[{j}]`")
+    return _masked(setup, rays, named, "cosmic-ray")
+
+
+def _psfs_of(observation: Observation) -> list[list[Array]]:
+    """Return the PSFs of each image, as its pixels see them."""
+    if not observation.psf_fields:
+        return [[psf] for psf in seen_psfs(observation)]
+    return [
+        list(seen_psfs(observation, np.array([field.at(x, y) for y in ys for x in xs])))
+        for field in observation.psf_fields
+        for xs, ys in [field.nodes]
+    ]
 
 
 def fit_exposures(setup: Setup) -> tuple[Setup, str]:

@@ -27,8 +27,9 @@ from lnocl.core.scene.star_psfs import owned, refuse_unowned
 from lnocl.core.scene.stars import check_positions
 from lnocl.core.solvers import SolverName
 
-CORES, EXPOSURES, LEVELS, PSFS, HALOS, PRIOR, CHOICE, STARS = STEPS = (
+CORES, RAYS, EXPOSURES, LEVELS, PSFS, HALOS, PRIOR, CHOICE, STARS = STEPS = (
     "mask saturated cores",
+    "mask cosmic rays",
     "fit exposures to stars",
     "fit levels of backgrounds",
     "judge PSFs before the run",
@@ -75,6 +76,7 @@ WHOLE = Condition(lambda plan: not plan.in_tiles, "the images are divided into t
 # What each step needs, in the order in which reasons are given.
 NEEDS: dict[str, tuple[Condition, ...]] = {
     CORES: (AUTO, MENDS, HAS_STARS),
+    RAYS: (AUTO, MENDS),
     EXPOSURES: (AUTO, MENDS, HAS_STARS, SEVERAL, ONE_EPOCH),
     LEVELS: (AUTO, HAS_ERROR, WHOLE),
     PSFS: (AUTO, HAS_STARS, SHOWS_PSFS),
@@ -133,6 +135,7 @@ class Plan:
     >>> obs = lnocl.Observation(np.stack([image] * 2), np.ones((3, 3)), epochs=[0, 1])
     >>> print(lnocl.plan(obs, [(8, 5)]))
     mask saturated cores: yes
+    mask cosmic rays: yes
     fit exposures to stars: no, stars may vary from epoch to epoch
     fit levels of backgrounds: no, backgrounds have no error
     judge PSFs before the run: yes, and fit shift, jitter, pixels

@@ -11,7 +11,7 @@ import numpy as np
 
 from lnocl.core.runs.options import StopName
 from lnocl.core.runs.outcome import Mended, PsfRefinement
-from lnocl.core.runs.plan import CORES, EXPOSURES, LEVELS, PSFS, Plan
+from lnocl.core.runs.plan import CORES, EXPOSURES, LEVELS, PSFS, RAYS, Plan
 from lnocl.core.runs.progress import Progress
 from lnocl.core.runs.start import Setup
 from lnocl.core.runs.steady import STEADY, steady_penalty
@@ -99,7 +99,11 @@ def _mend_images(plan: Plan) -> tuple[Setup, dict[str, str]]:
     """Return the setup of a plan with images mended, and in words what was."""
     from lnocl.core.runs import mends  # which loads scipy
 
-    steps = {CORES: mends.mask_cores, EXPOSURES: mends.fit_exposures}
+    steps = {
+        CORES: mends.mask_cores,
+        RAYS: mends.mask_rays,
+        EXPOSURES: mends.fit_exposures,
+    }
     setup, found = plan.setup, dict[str, str]()
     for step in filter(plan.does, steps):
         setup, found[step] = steps[step](setup)
