@@ -2,7 +2,8 @@
 
 Light is summed in circles round each star, the mean of a ring taken off, and divided by the same of
 its PSF. The ratio of two images then hardly hangs on the shapes of PSFs, and not on what lies under
-the star. Circles of two sizes tell a zero point, which both have, from a PSF that is wrong.
+the star. Circles of three sizes tell a zero point, which all have, from a PSF that is wrong, and
+from light beside the star, such as a cosmic ray, that one image has.
 """
 
 from __future__ import annotations
@@ -16,16 +17,16 @@ from lnocl.core.scene.cores import fwhm
 from lnocl.core.scene.detector import seen_psfs
 from lnocl.core.scene.scene import Scene
 
-# Radii of the two circles and of the ring, in the widths of the widest PSF, and pixels at least.
-CIRCLES, RING, LEAST_WIDTH = (1.5, 2.5), (3.0, 4.5), 1.5
+# Radii of the circles and of the ring, in the widths of the widest PSF, and pixels at least.
+CIRCLES, RING, LEAST_WIDTH = (0.7, 1.5, 2.5), (3.0, 4.5), 1.5
 # Stars with this relative error at most are used, the brightest; more than this is not known of
 # each, which may vary a little.
 FAINTEST, MOST_STARS, SYSTEMATIC = 0.1, 100, 0.005
 # Bad pixels may hold this share of a star's light, and leave so much of the ring.
 HIDDEN, LEFT = 0.05, 0.5
-# A zero point is used that is more than this, so many times its error, and the same in both circles
-# but for this share or so many errors.
-LEAST, SIGNIFICANT, ALIKE, APART = 0.03, 4.0, 0.25, 3.0
+# A zero point is used that is more than this, so many times its error, and the same in all circles
+# but for these shares, in the least and the largest beside the other, or so many errors.
+LEAST, SIGNIFICANT, ALIKE, APART = 0.03, 4.0, (0.5, 0.25), 3.0
 
 
 class ZeroPoints(NamedTuple):
@@ -46,22 +47,22 @@ class ZeroPoints(NamedTuple):
 
 def zero_points(scene: Scene) -> ZeroPoints | None:
     """Return the zero points that are used, 0 where none is; None where no image has one."""
-    small, large = (_measured(scene, radius) for radius in CIRCLES)
-    if small is None or large is None:
+    measured = [_measured(scene, radius) for radius in CIRCLES]
+    found = [each for each in measured if each is not None]
+    if len(found) < len(CIRCLES):
         return None
-    change, error = small.values - large.values, np.hypot(small.errors, large.errors)
+    core, middle, large = found
     with np.errstate(invalid="ignore"):
-        is_used = np.all(
-            [
-                abs(each.values) > np.maximum(LEAST, SIGNIFICANT * each.errors)
-                for each in (small, large)
-            ],
-            axis=0,
-        )
-        is_used &= abs(change) < np.maximum(ALIKE * abs(small.values), APART * error)
+        is_used = np.ones(scene.n_images, bool)
+        for each in (middle, large):
+            is_used &= abs(each.values) > np.maximum(LEAST, SIGNIFICANT * each.errors)
+        for each, share in zip((core, large), ALIKE, strict=True):
+            apart = APART * np.hypot(each.errors, middle.errors)
+            change = abs(each.values - middle.values)
+            is_used &= change < np.maximum(share * abs(middle.values), apart)
     if not is_used.any():
         return None
-    return small._replace(values=np.where(is_used, small.values, 0.0))
+    return middle._replace(values=np.where(is_used, middle.values, 0.0))
 
 
 def _measured(scene: Scene, radius: float) -> ZeroPoints | None:
