@@ -18,6 +18,7 @@ from lnocl.core.runs.plan import Plan
 from lnocl.core.runs.plan import plan as make_plan
 from lnocl.core.runs.preparation import Prepared, prepare
 from lnocl.core.runs.progress import Progress
+from lnocl.core.runs.start import Setup
 from lnocl.core.scene.arrays import Array, together, whole
 from lnocl.core.scene.counts import mean_exposure, means
 from lnocl.core.scene.grid import psf_shape
@@ -392,7 +393,7 @@ class _Mosaic:
     def __init__(
         self, observation: Observation, positions: Array, plan: Plan, spans: tuple[Span, Span]
     ) -> None:
-        self.setup = plan.setup
+        self._plan = plan
         self.plan, n_epochs = tuple(str(plan).splitlines()), observation.n_epochs
         self.observation = observation
         self.given_positions = np.repeat(positions, n_epochs, axis=0)
@@ -451,6 +452,11 @@ class _Mosaic:
             "tiles": np.array([each.row for each in self.found], TILE_DTYPE),
         }
         return TiledResult(**vars(longest) | same | found)
+
+    @property
+    def setup(self) -> Setup:
+        """The parameters of all tiles."""
+        return self._plan.setup
 
     def models(self) -> Iterator[Array]:
         """Yield the models of the images."""

@@ -111,6 +111,16 @@ class TestRays:
         assert not mask[0].any()
         assert prepared.found[RAYS] == f"{mask.sum()} pixels of `images[1]`"
 
+    def test_those_on_the_star_are_found_beside_its_model(self):
+        image, _ = self.image()
+        rays = np.zeros_like(image)
+        rays[17, 21] = 4e3
+        given = lnocl.Observation([image + rays, image], PSF, background=LEVEL)
+        mask = prepare(lnocl.plan(given, [STAR], refine_psfs=())).setup.observation.mask
+        assert mask[0, 17, 21]
+        assert mask[0].sum() == mask[0, 16:19, 20:23].sum()  # with what the ray spreads to
+        assert not mask[1].any()
+
     def test_the_star_has_its_flux(self):
         image, rays = self.image()
         given = lnocl.Observation(image + rays, PSF, background=LEVEL)

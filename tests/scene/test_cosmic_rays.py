@@ -45,7 +45,7 @@ def sky(make, seed):
 def find(image, make, level=LEVEL, mask=NONE):
     psf = make(30, 30, (61, 61))
     noise = np.sqrt(np.maximum(image, level))
-    return cosmic_rays(np.where(mask, 0.0, image - level), noise, mask, [psf], True)
+    return cosmic_rays(np.where(mask, 0.0, image - level), noise, mask, [psf])
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -76,7 +76,7 @@ def test_right_scenes_have_none_where_the_psf_is_a_fifth_too_wide(name):
         wide = gaussian_filter(PSFS[name](30, 30, (61, 61)), 0.6 * WIDTHS[name] / 2.35)
         image = chance.poisson(light).astype(float)
         noise = np.sqrt(np.maximum(image, LEVEL))
-        assert not cosmic_rays(image - LEVEL, noise, NONE, [wide], True).any()
+        assert not cosmic_rays(image - LEVEL, noise, NONE, [wide]).any()
 
 
 @pytest.mark.parametrize("level", [0.003, 0.1, 3.0, 1e3])

@@ -53,7 +53,7 @@ def mask_rays(setup: Setup) -> tuple[Setup, str]:
     from lnocl.core.scene.blemishes import cosmic_rays
 
     observation = setup.observation
-    rays, named = np.zeros(observation.mask.shape, bool), []
+    rays = np.zeros(observation.mask.shape, bool)
     measured = zip(measure_noise(observation), _psfs_of(observation), strict=True)
     for j, (noise, psfs) in enumerate(measured):
         counts, mask, background = (
@@ -61,7 +61,7 @@ def mask_rays(setup: Setup) -> tuple[Setup, str]:
         )
         factor = 1.0 if noise is None else max(np.exp(noise.log_factor()), 1.0)
         error = np.sqrt(factor * np.maximum(counts, np.maximum(background, LEAST)))
-        found = cosmic_rays(np.where(mask, 0.0, counts - background), error, mask, psfs, True)
+        found = cosmic_rays(np.where(mask, 0.0, counts - background), error, mask, psfs)
         stars = np.round(observation.places(j, setup.stars)).astype(int)
         at_stars = stars[np.all((stars >= 0) & (stars < observation.shape[::-1]), axis=1)]
         near = np.zeros(mask.shape, bool)
@@ -69,8 +69,14 @@ def mask_rays(setup: Setup) -> tuple[Setup, str]:
         is_ray = found[near]
         if found.any() and not (len(is_ray) and is_ray.mean() > MOST_STARS):
             rays[j] = found & ~binary_dilation(near, np.ones((3, 3)))
-            if n := int(rays[j].sum()):
-                named.append(f"{counted(n, 'pixel')} of `images[{j}]`")
+    masked = replace(setup, observation=observation.replace(mask=observation.mask | rays))
+    if len(setup.stars):
+        from lnocl.core.scene.saturation import rays_on_stars
+
+        with ignored_warnings(), ignored_notes():
+            rays |= rays_on_stars(masked.scene(Penalty()), rays)
+    numbers = enumerate(rays.sum(axis=(1, 2)).tolist())
+    named = [f"{counted(n, 'pixel')} of `images[{j}]`" for j, n in numbers if n]
     return _masked(setup, rays, named, "cosmic-ray")
 
 

@@ -87,9 +87,7 @@ def _sharp(
         sharp |= new | (ndimage.binary_dilation(new, np.ones((3, 3))) & is_bright)
 
 
-def cosmic_rays(
-    light: Array, noise: Array, bad: Mask, psfs: Sequence[Array], are_counts: bool = False
-) -> Mask:
+def cosmic_rays(light: Array, noise: Array, bad: Mask, psfs: Sequence[Array]) -> Mask:
     """Return where an image is sharper than its PSF, as `sharp_pixels`, and is no ring of a star.
 
     A pixel is left out where something brighter, farther from it than the core of a PSF, may shed
@@ -98,8 +96,8 @@ def cosmic_rays(
 
     Parameters
     ----------
-    light, noise, bad, psfs, are_counts
-        As for `sharp_pixels`; PSFs are of one shape.
+    light, noise, bad, psfs
+        As for `sharp_pixels`; PSFs are of one shape. The image may be of whole counts.
     """
     holes, _ = ndimage.label(bad, np.ones((3, 3)))
     is_hidden = (np.bincount(holes.ravel()) >= HIDING)[holes] & bad
@@ -117,7 +115,7 @@ def cosmic_rays(
         return shed
 
     shares = np.min([_least_shares(psf) for psf in psfs], axis=0) ** 2 / 2.0
-    return _sharp(light, noise, bad, shares, are_counts, is_shed)
+    return _sharp(light, noise, bad, shares, True, is_shed)
 
 
 def _lobes(psf: Array, most: int) -> Array:

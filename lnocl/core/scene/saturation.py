@@ -1,4 +1,4 @@
-"""Cores of stars that a detector has lost: clipped at one value, set to 0, or wrapped round.
+"""Cores of stars that a detector has lost, clipped, set to 0 or wrapped round; and rays on them.
 
 A core is looked at beside the star's own wings. Its PSF and a level are fitted to the pixels
 outside, with slopes of the PSF, so that the place may be a little off, and a broad host. A core is
@@ -15,6 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from lnocl.core.scene.arrays import Array, Mask
+from lnocl.core.scene.blemishes import cosmic_rays
 from lnocl.core.scene.cores import fwhm
 from lnocl.core.scene.detector import seen_psfs
 from lnocl.core.scene.scene import Scene
@@ -43,6 +44,10 @@ HOLE = 0.5
 # Parts of the core that are left out of the fit, by their share of the peak, and how well the PSF
 # is to fit round it: the rms of what is left over the light.
 PARTS, FITTED = (0.9, 0.7, 0.5, 0.3, 0.2, 0.1, 0.05), 0.15
+
+# Rays on a star are looked for where the PSF is wider than this, pixels, and taken to be wrong by
+# this share of the model, from which so many fits leave out what is so many times that above it.
+SHARPEST, RAY_ERROR, CLIPS, CLIPPED = 2.2, 0.25, 4, 4.0
 
 
 class LostCore(NamedTuple):
@@ -97,6 +102,47 @@ def lost_cores(scene: Scene) -> Iterator[LostCore]:
     Not of stars with PSFs of their own, whose core a coronagraph may hide.
     """
     observation = scene.observation
+    for j, s, (rows, columns), core in _cores(scene):
+        counts = core.light + _pixels(observation.background, j, rows, columns)
+        counts = counts - _pixels(observation.read_noise, j, rows, columns) ** 2
+        if (flat := _flat(core, counts)) is not None:
+            yield LostCore(j, s, rows, columns, flat, float(counts[flat].max()))
+        elif (hole := _hole(core)) is not None:
+            yield LostCore(j, s, rows, columns, hole, math.nan)
+
+
+def rays_on_stars(scene: Scene, known: Mask) -> Mask:
+    """Return where images are sharper than their PSFs beside the models of their stars.
+
+    The models are those of `lost_cores`, without pixels that are far above them. Nothing is said of
+    PSFs so narrow that a star's place between pixels makes it sharp. Rays that are known
+    are masked.
+    """
+    observation = scene.observation
+    rays, psfs = np.zeros(observation.mask.shape, bool), seen_psfs(observation)
+    is_wide = [fwhm(psf) > SHARPEST for psf in psfs]
+    for j, _, (rows, columns), core in _cores(scene):
+        used, found = core.good.copy(), None
+        for _ in range(CLIPS if is_wide[j] else 0):
+            if (found := core.model(used)) is None:
+                break
+            left = core.light - found[0]
+            noise = np.sqrt(core.variance + (RAY_ERROR * found[0]) ** 2)
+            used &= left < CLIPPED * noise
+        if found is not None:
+            # A PSF that is wrong leaves as much below the model as above it.
+            below = float((-left / noise)[core.good].max(initial=0.0))
+            noise *= max(below / CLIPPED, 1.0)
+            masked = known[j, rows, columns]
+            left[masked] = 0.0  # as beside the star, where nothing else is known
+            found_there = cosmic_rays(left, noise, ~(core.good | masked), [psfs[j]])
+            rays[j, rows, columns] |= found_there & ~masked
+    return rays
+
+
+def _cores(scene: Scene) -> Iterator[tuple[int, int, tuple[slice, slice], _Core]]:
+    """Yield each star in each image that shows it, and the window that it is in."""
+    observation = scene.observation
     if not scene.n_stars:
         return
     from scipy.spatial import KDTree  # which the start of a command need not load
@@ -113,15 +159,8 @@ def lost_cores(scene: Scene) -> Iterator[LostCore]:
                 for at, n in zip(places[k][::-1].tolist(), observation.shape, strict=True)
             )
             core = _cut(scene, j, s, shown[[i for i in near[k] if i != k]].tolist(), rows, columns)
-            if core is None:
-                continue
-            counts = core.light + _pixels(observation.background, j, rows, columns)
-            counts = counts - _pixels(observation.read_noise, j, rows, columns) ** 2
-            if (flat := _flat(core, counts)) is not None:
-                level = float(counts[flat].max())
-                yield LostCore(j, s, rows, columns, flat, level)
-            elif (hole := _hole(core)) is not None:
-                yield LostCore(j, s, rows, columns, hole, math.nan)
+            if core is not None:
+                yield j, s, (rows, columns), core
 
 
 def _pixels(values: Array, j: int, rows: slice, columns: slice) -> Array | float:
