@@ -52,6 +52,7 @@ def deconvolve(
     progress: bool = False,
     refine_positions: bool | Literal["auto"] = "auto",
     refine_psfs: Literal["auto"] | Iterable[Family] = "auto",
+    mend_images: bool = True,
     checkpoint: str | PathLike[str] | None = None,
     resume: str | PathLike[str] | None = None,
 ) -> Result:
@@ -175,6 +176,15 @@ def deconvolve(
 
         The extended source is marginalised. An empty sequence is for none. See Notes. At least one
         star.
+    mend_images : bool, optional
+        Mask saturated cores of stars and cosmic rays, and fit relative exposures to stars, where
+        `smoothing` is "auto".
+
+        Cores are flat at their top, 0, or wrapped round (`lnocl.core.scene.saturation`). Cosmic
+        rays are sharper than the PSF (`lnocl.core.scene.blemishes`). Exposures
+        of several images of one epoch are multiplied by the factor that all stars show, where it is
+        significant (`lnocl.core.scene.zero_points`); the image in the middle keeps its own. A line
+        of the log and the plan of the result say what was mended.
     checkpoint : str or path, optional
         File for the state of the run (FITS), saved after the first iteration, every minute and at
         the end.
@@ -356,6 +366,7 @@ def deconvolve(
         initial_star_fluxes=initial_star_fluxes,
         refine_positions=refine_positions,
         refine_psfs=refine_psfs,
+        mend_images=mend_images,
     )
     prepared = prepare(plan, progress)
     inputs = partial(
@@ -370,7 +381,7 @@ def deconvolve(
     if callback is not None:
         callback = np.errstate(**np.geterr())(callback)  # which NumPy may well warn
     outcome = reconstruct(prepared, callback, progress, checkpointer)
-    outcome = _finish(outcome, plan, prepared, progress)
+    outcome = _finish(outcome, replace(plan, found=prepared.found), prepared, progress)
     result = make_result(outcome)
     warn_of_faults(result, progress)
     return result

@@ -223,7 +223,9 @@ class MisfitWarning(LnoclWarning):
     >>> observation = lnocl.Observation(image, np.ones((3, 3)))
     >>> with warnings.catch_warnings():
     ...     warnings.simplefilter("ignore", lnocl.errors.MisfitWarning)
-    ...     result = lnocl.deconvolve(observation, n_iter=1, stop=None, engine="numpy")
+    ...     result = lnocl.deconvolve(
+    ...         observation, n_iter=1, stop=None, engine="numpy", mend_images=False
+    ...     )
     >>> result.verdict()
     ['the model does not fit: see to background, noise and gain']
     """

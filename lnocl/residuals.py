@@ -34,14 +34,18 @@ OVERFIT = 0.6
 class Fit(NamedTuple):
     """How well a model m fits the counts g of some pixels.
 
+    Each pixel has the weight ``w = m / (m + 1/2)``: of less than an electron it tells little. So
+    chi squared, ``sum w (g - m)^2 / m``, is ``sum w`` for Poisson counts, and its variance, ``sum
+    w^2 (2 + 1 / m)``, is twice that, whatever m.
+
     Attributes
     ----------
     n_pixels : int
         Good pixels.
     square_sum : float
-        The sum of ``(g - m)^2 / m``.
+        Chi squared.
     variance : float
-        Its variance for Poisson counts, ``sum (2 + 1 / m)``.
+        Its variance for Poisson counts, ``2 sum w``.
 
     See Also
     --------
@@ -50,7 +54,7 @@ class Fit(NamedTuple):
     Examples
     --------
     >>> from lnocl.residuals import Fit
-    >>> fit = Fit(n_pixels=10000, square_sum=40000.0, variance=20100.0)
+    >>> fit = Fit(n_pixels=10000, square_sum=40000.0, variance=20000.0)
     >>> fit.rms, round(fit.error, 4), fit.is_misfit, fit.is_overfit
     (2.0, 0.0071, True, False)
     """
@@ -63,10 +67,9 @@ class Fit(NamedTuple):
     def of(cls, values: Array, models: Array) -> Fit:
         """Return the fit of pixels with these residuals and models."""
         good = ~np.isnan(values)
-        n = int(np.count_nonzero(good))
-        square_sum = float(np.sum(values**2, where=good))
-        inverse = np.divide(1.0, models, out=np.zeros_like(models), where=good)
-        return cls(n, square_sum, 2.0 * n + float(inverse.sum()))
+        weights = np.divide(models, models + 0.5, out=np.zeros_like(models), where=good)
+        square_sum = float(np.sum(weights * values**2, where=good))
+        return cls(int(np.count_nonzero(good)), square_sum, 2.0 * float(weights.sum()))
 
     def plus(self, other: Fit) -> Fit:
         """Return the fit of these pixels and others."""
@@ -78,13 +81,13 @@ class Fit(NamedTuple):
 
     @property
     def rms(self) -> float:
-        """Rms of ``(g - m) / sqrt(m)``: 1 for noise alone, less where the model follows noise."""
-        return math.sqrt(self.square_sum / self.n_pixels) if self.n_pixels else math.nan
+        """Rms of ``(g - m) / sqrt(m)``, weighted: 1 for noise, less where the model follows it."""
+        return math.sqrt(2.0 * self.square_sum / self.variance) if self.variance else math.nan
 
     @property
     def error(self) -> float:
         """The standard error of the rms by noise, where the model fits."""
-        return math.sqrt(self.variance) / self.n_pixels / 2.0 if self.n_pixels else math.nan
+        return 1.0 / math.sqrt(self.variance) if self.variance else math.nan
 
     @property
     def is_misfit(self) -> bool:

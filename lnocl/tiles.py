@@ -18,6 +18,7 @@ from lnocl.core.runs.plan import Plan
 from lnocl.core.runs.plan import plan as make_plan
 from lnocl.core.runs.preparation import Prepared, prepare
 from lnocl.core.runs.progress import Progress
+from lnocl.core.runs.start import Setup
 from lnocl.core.scene.arrays import Array, together, whole
 from lnocl.core.scene.counts import mean_exposure, means
 from lnocl.core.scene.grid import psf_shape
@@ -36,6 +37,7 @@ from lnocl.tiling import Span, Tile, cut, lay
 
 # Of those of `lnocl.deconvolve`, beside parameters.
 OPTIONS = {"solver", "precision", "engine", "device", "pad", "refine_positions", "refine_psfs"}
+OPTIONS |= {"mend_images"}
 # The tiles with the brightest extended source, of whose choices that in the middle is taken.
 N_CHOOSING = 3
 # Warnings of tiles that are given in full.
@@ -173,7 +175,7 @@ def deconvolve_tiles(
         Show progress, as `lnocl.deconvolve` does.
     **options
         Others of `lnocl.deconvolve`: solver, precision, engine, device, pad, refine_positions,
-        refine_psfs.
+        refine_psfs, mend_images.
 
     Returns
     -------
@@ -261,7 +263,7 @@ def deconvolve_tiles(
     if isinstance(prepared.stop, str):
         chosen = _choose(observed, parallel, replace(prepared, fits=False))
         prepared = _ending(prepared, chosen)
-    mosaic = _Mosaic(observation, positions, plan, tiles[0])
+    mosaic = _Mosaic(observation, positions, replace(plan, found=prepared.found), tiles[0])
     with (
         Progress(len(observed), "tile", progress, "deconvolving") as bar,
         closing(work(partial(partial, _solve, prepared), observed, parallel)) as answers,
@@ -391,6 +393,7 @@ class _Mosaic:
     def __init__(
         self, observation: Observation, positions: Array, plan: Plan, spans: tuple[Span, Span]
     ) -> None:
+        self._plan = plan
         self.plan, n_epochs = tuple(str(plan).splitlines()), observation.n_epochs
         self.observation = observation
         self.given_positions = np.repeat(positions, n_epochs, axis=0)
@@ -449,6 +452,11 @@ class _Mosaic:
             "tiles": np.array([each.row for each in self.found], TILE_DTYPE),
         }
         return TiledResult(**vars(longest) | same | found)
+
+    @property
+    def setup(self) -> Setup:
+        """The parameters of all tiles."""
+        return self._plan.setup
 
     def models(self) -> Iterator[Array]:
         """Yield the models of the images."""

@@ -58,6 +58,33 @@ def test_noise_gives_one(known):
     assert not any(fit.is_misfit for fit in found)
 
 
+@pytest.mark.parametrize("level", [1e-9, 0.002, 0.3])
+def test_few_counts_have_their_moments_too(level):
+    """Most pixels are empty, where 1 / m is beyond measure."""
+    models = np.where(np.random.default_rng(1).random((60, 60)) < 0.2, 0.05, level)
+    chance, mask = np.random.default_rng(6), np.zeros(models.shape, bool)
+    draws = chance.poisson(models, (200, *models.shape)).astype(float)
+    found = [Fit.of(residuals(each, mask, models), models) for each in draws]
+    squares = np.array([fit.square_sum for fit in found])
+    expected, variance = found[0].variance / 2.0, found[0].variance
+    assert abs(squares.mean() - expected) < 3.0 * np.sqrt(variance / len(squares))
+    assert 0.8 < squares.var() / variance < 1.25
+    assert not any(fit.is_misfit or fit.is_overfit for fit in found)
+    assert all(fit.error < 0.1 for fit in found)
+
+
+@pytest.mark.filterwarnings("error::lnocl.errors.MisfitWarning")
+def test_a_model_of_few_counts_is_not_said_to_follow_the_noise():
+    y, x = np.indices((40, 40))
+    psf = np.exp(-((x[:21, :21] - 10) ** 2 + 1.4 * (y[:21, :21] - 9.7) ** 2) / 3.0)
+    light = 0.02 + 3.0 * np.exp(-((x - 25) ** 2 + (y - 18) ** 2) / 30.0)
+    image = np.random.default_rng(0).poisson(light)
+    observation = lnocl.Observation(image, psf, background=0.02)
+    result = lnocl.deconvolve(observation, engine="numpy")
+    assert result.verdict() == ["the model fits"]
+    assert 0.8 < result.fit().rms < 1.1
+
+
 def test_pixels_are_those_of_the_images(known):
     observation, scene, models = known
     overall, at_stars = (
@@ -65,10 +92,11 @@ def test_pixels_are_those_of_the_images(known):
         judge_stars(Estimate(scene, no_sky(scene), FLUXES)),
     )
     good = ~observation.mask
-    squares = (observation.images - models) ** 2 / models
+    squares = (observation.images - models) ** 2 / (models + 0.5)
     assert overall.n_pixels == good.sum()
     np.testing.assert_allclose(overall.square_sum, squares[good].sum(), rtol=1e-12)
-    np.testing.assert_allclose(overall.variance, (2.0 + 1.0 / models[good]).sum(), rtol=1e-12)
+    variance = 2.0 * models / (models + 0.5)
+    np.testing.assert_allclose(overall.variance, variance[good].sum(), rtol=1e-12)
     for (x, y), found in zip(STARS, at_stars, strict=True):
         core, wings = np.zeros((2, *good.shape), bool)
         for j, (dx, dy) in enumerate(OFFSETS):
@@ -147,7 +175,7 @@ def test_windows_hold_the_models_of_a_result(exposure, pad):
     models = result.models()
     good = ~observation.mask
     squares = np.divide(
-        (observation.images - models) ** 2, models, out=np.zeros_like(models), where=good
+        (observation.images - models) ** 2, models + 0.5, out=np.zeros_like(models), where=good
     )
     for (x, y), found in zip(result.star_positions, result.star_residuals(), strict=True):
         total, n = 0.0, 0

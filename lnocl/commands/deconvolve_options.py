@@ -83,6 +83,12 @@ OPTIONS = {
         ),
         parameter(Calibration, "mask", metavar="FILE", checksum="MSUM"),
         SATURATION,
+        parameter(
+            deconvolve,
+            "mend_images",
+            action=options.EITHER,
+            card=("MENDED", "whether images were mended"),
+        ),
         parameter(Calibration, "noise", kinds=NOISE, checksum="NSUM"),
         parameter(Calibration, "align"),
         parameter(Calibration, "angle", metavar="ANGLE", checksum="ASUM"),

@@ -111,6 +111,8 @@ class Option:
         action = self.keywords.get("action")
         if action in SWITCHES:
             return flag if value is SWITCHES[action] else []
+        if action is EITHER and value is self.default:
+            return []
         if action is EITHER and value is False:
             return [self.flags[0].replace("--", "--no-", 1)]
         if action is EITHER:

@@ -10,9 +10,9 @@ from scipy import ndimage
 from scipy.special import erf
 
 from lnocl.core.scene.arrays import Array, Mask, darker_noise
+from lnocl.core.scene.blemishes import flat_tops, sharp_pixels
 from lnocl.core.scene.cores import core, fwhm
 from lnocl.core.scene.quantities import in_unit, split
-from lnocl.detection.blemishes import flat_tops, sharp_pixels
 from lnocl.detection.checks import read_image, read_psf
 from lnocl.detection.maxima import SIGNIFICANT
 from lnocl.detection.search import PointSources, around, find_points, in_boxes, pixels_at
@@ -74,9 +74,9 @@ def find_stars(
     brightest first, so that their side lobes are no stars. Maxima in the wings of brighter stars
     are left out unless they are half as bright as those wings. So are extended sources: maxima that
     the PSF, smoothed by a Gaussian of 0.4 of its width, fits better than the PSF. Pixels sharper
-    than the PSF, as cosmic rays leave them, are bad (`lnocl.detection.blemishes.sharp_pixels`), and
-    sources less than 0.6 times as wide are left out. Pixels of flat tops count as saturated, and a
-    line of the log says how many (`lnocl.detection.blemishes.flat_tops`).
+    than the PSF, as cosmic rays leave them, are bad, and sources less than 0.6 times as wide are
+    left out. Pixels of flat tops count as saturated, and a line of the log says how many
+    (`lnocl.core.scene.blemishes`).
 
     Stars are sought from 5 standard deviations on, also where the threshold is higher: the noise of
     the filtered image is that without them.

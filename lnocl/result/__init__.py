@@ -356,7 +356,7 @@ class Result(Measured):
 
     @property
     def _unit(self) -> str:
-        return "electron" if (self._observation.exposure == 1.0).all() else "electron/s"
+        return "electron/s" if self._findings.setup.is_rate else "electron"
 
     def _halo_lines(self) -> list[str]:
         """Return the amounts of each halo in words, electrons."""

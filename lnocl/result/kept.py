@@ -56,8 +56,13 @@ def to_parts(outcome: Outcome, given: Observation) -> Parts:
     parts["positions"] = scene.stars
     for name in BY_COMMAND:
         parts.pop(f"setup.{name}", None)
+    mask = scene.observation.mask
+    if not np.array_equal(mask, before.mask):
+        parts["observation.mask"] = mask
+    # Of what is normalised over good pixels, the run began with this too.
+    masked = _masked(before, parts)
     for name in FIELDS:
-        old, new = (np.asarray(getattr(each, name)) for each in (before, scene.observation))
+        old, new = (np.asarray(getattr(each, name)) for each in (masked, scene.observation))
         if not (old is new or np.array_equal(old, new)):
             is_shared = new.ndim > 2 and new.strides[0] == 0  # one for all images
             parts[f"observation.{name}"] = new[:1] if is_shared else new
@@ -75,7 +80,9 @@ def from_parts(
     parts, before = dict(parts), given.upright()
     if DIGEST not in parts or str(parts.pop(DIGEST)) != _digest(parts, before):
         return None
-    observation = before.replace(**_part(parts, "observation."))
+    changes = _part(parts, "observation.")
+    changes.pop("mask", None)
+    observation = _masked(before, parts).replace(**changes)
     setup = _built(
         Setup, parts, "setup.", observation=observation, device=device, precision=precision
     )
@@ -95,6 +102,12 @@ def from_parts(
         plan=_words(parts["plan"]),
         psf_refinement=_refinement(_part(parts, "psf_refinement.")),
     )
+
+
+def _masked(given: Observation, parts: Parts) -> Observation:
+    """Return an observation with the pixels masked that a run has."""
+    mask = parts.get("observation.mask")
+    return given if mask is None else given.replace(mask=mask)
 
 
 def _flat(value: Any, name: str = "") -> Iterator[tuple[str, NDArray[Any]]]:

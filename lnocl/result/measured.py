@@ -17,12 +17,17 @@ if TYPE_CHECKING:
     from astropy.io import fits
 
     from lnocl.core.runs.bootstrap import Bootstrap
+    from lnocl.core.runs.start import Setup
     from lnocl.parallel import Parallel
     from lnocl.significance import Significance
 
 
 class Findings(Protocol):
     """What a result is computed from when it is asked for: the outcome of a run, or of tiles."""
+
+    @property
+    def setup(self) -> Setup:
+        """The parameters of the run, or those of all tiles."""
 
     @property
     def observation(self) -> Observation:

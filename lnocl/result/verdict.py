@@ -10,6 +10,7 @@ import numpy as np
 from lnocl.core.runs.progress import Progress
 from lnocl.core.scene.arrays import Array
 from lnocl.core.scene.detector import on_sky
+from lnocl.core.scene.star_psfs import owned
 from lnocl.core.scene.stars import MAX_SHIFT
 from lnocl.errors import MisfitWarning, counted, warn
 
@@ -81,11 +82,16 @@ def faults(result: Result) -> list[str]:
             f"{lost.words('; ')}: give the place where it is brightest"
         )
     if unfitted:
-        remedy = ", or try `refine_psfs` jitter pixels" if findings.may_free_pixels else ""
+        from lnocl.core.scene.psf_faults import name_faults  # which loads scipy
+
+        places = findings.given_positions[::n_epochs]
+        seen = places[owned(findings.observation, places) < 0]
+        remedy = name_faults(findings.observation, seen) or "give a better PSF" + (
+            ", or try `refine_psfs` jitter pixels" if findings.may_free_pixels else ""
+        )
         lines.append(
             f"the model does not fit at {len(unfitted)} of "
-            f"{counted(len(at_stars) // n_epochs, 'star')}, {unfitted.words(' ')}: give a better "
-            f"PSF{remedy}"
+            f"{counted(len(at_stars) // n_epochs, 'star')}, {unfitted.words(' ')}: {remedy}"
         )
     elif overall.is_misfit and not (dark or lost):
         lines.append("the model does not fit: see to background, noise and gain")

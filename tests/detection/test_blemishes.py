@@ -5,7 +5,7 @@ from contextlib import nullcontext
 import numpy as np
 import pytest
 
-from lnocl.detection.blemishes import flat_tops, sharp_pixels
+from lnocl.core.scene.blemishes import flat_tops, sharp_pixels
 
 pytest.importorskip("photutils", reason="photutils is not installed")
 from lnocl.detection import find_stars

@@ -76,7 +76,13 @@ def test_light_beside_a_place_without_any_is_named_in_pixels_of_the_images():
     assert "pixels lies at (21.25, 18.25): give" in _elsewhere(sky, np.array([20.0, 21.0]), 2)
 
 
-def test_a_star_that_moved_as_far_as_stars_may_is_named_first():
+@pytest.fixture
+def nameless(monkeypatch):
+    """The fault of the PSF is of no kind that has a name."""
+    monkeypatch.setattr("lnocl.core.scene.psf_faults.name_faults", lambda *_: "")
+
+
+def test_a_star_that_moved_as_far_as_stars_may_is_named_first(nameless):
     def at(*given):
         bad = StarResiduals(Fit(100, 900.0, 200.0), Fit(), 0.0, 0.0)
         result = SimpleNamespace(
@@ -90,7 +96,7 @@ def test_a_star_that_moved_as_far_as_stars_may_is_named_first():
             _findings=SimpleNamespace(
                 given_positions=np.array([given]),
                 may_free_pixels=True,
-                observation=SimpleNamespace(n_epochs=1),
+                observation=SimpleNamespace(n_epochs=1, star_places=()),
             ),
         )
         return faults(result)
@@ -101,11 +107,13 @@ def test_a_star_that_moved_as_far_as_stars_may_is_named_first():
     assert len(at(10.0, 10.5)) == 1
 
 
-def test_a_star_counts_once_and_its_epochs_are_named():
+def test_a_star_counts_once_and_its_epochs_are_named(nameless):
     bad = StarResiduals(Fit(100, 900.0, 200.0), Fit(), 0.2, 0.8)
     places = np.repeat([(10.0, 13.0), (20.0, 9.0)], 2, axis=0)
     findings = SimpleNamespace(
-        given_positions=places, may_free_pixels=False, observation=SimpleNamespace(n_epochs=2)
+        given_positions=places,
+        may_free_pixels=False,
+        observation=SimpleNamespace(n_epochs=2, star_places=()),
     )
     result = SimpleNamespace(
         star_positions=places, star_fluxes=np.array([5.0, np.nan, 6.0, 7.0]), psf_refinement=None,

@@ -9,9 +9,20 @@ from astropy.io import fits
 
 import lnocl
 from lnocl import reconstruction
-from lnocl.core.runs import halos, psf_refinement
+from lnocl.core.runs import halos, mends, psf_refinement
 from lnocl.core.runs.outcome import Mended
-from lnocl.core.runs.plan import CHOICE, HALOS, LEVELS, PRIOR, PSFS, STARS, STEPS
+from lnocl.core.runs.plan import (
+    CHOICE,
+    CORES,
+    EXPOSURES,
+    HALOS,
+    LEVELS,
+    PRIOR,
+    PSFS,
+    RAYS,
+    STARS,
+    STEPS,
+)
 from lnocl.core.runs.preparation import prepare
 from lnocl.core.scene.penalty import recommend_smoothing
 from lnocl.errors import InputError
@@ -31,13 +42,20 @@ def observe(n=1, psfs=PSF, **known):
 
 
 # The steps of a star in one image; then what is other in others, and what is said of it.
-PLAIN = {PSFS, PRIOR, CHOICE, STARS}
+MENDED = {CORES, RAYS}
+PLAIN = MENDED | {PSFS, PRIOR, CHOICE, STARS}
 SCENES = {
     "plain": (observe, STAR, {}, PLAIN, "backgrounds have no error"),
-    "no star": (observe, (), {}, {CHOICE}, "there are no stars"),
+    "no star": (observe, (), {}, {RAYS, CHOICE}, "there are no stars"),
     "a weight": (observe, STAR, {"smoothing": 0.1}, {CHOICE}, "`smoothing` is a number"),
-    "a number of iterations": (observe, STAR, {"stop": None}, {PSFS, STARS}, "another rule"),
-    "turned": (lambda: observe(2, transforms=TURNED), STAR, {}, PLAIN, "no halos"),
+    "a number of iterations": (
+        observe,
+        STAR,
+        {"stop": None},
+        {CORES, RAYS, PSFS, STARS},
+        "another rule",
+    ),
+    "turned": (lambda: observe(2, transforms=TURNED), STAR, {}, PLAIN | {EXPOSURES}, "no halos"),
     "epochs": (lambda: observe(2, epochs=[0, 1]), STAR, {}, PLAIN, "no halos"),
     "a halo": (lambda: observe(halos=[HALO]), STAR, {}, PLAIN | {HALOS}, "have no error"),
     "a field": (lambda: observe(psfs=FIELD), STAR, {}, PLAIN, "no halos"),
@@ -71,6 +89,9 @@ def test_a_run_takes_the_steps_of_its_plan(name, monkeypatch):
 
         monkeypatch.setattr(module, function, watched)
 
+    watch(CORES, mends, "mask_cores")
+    watch(RAYS, mends, "mask_rays")
+    watch(EXPOSURES, mends, "fit_exposures")
     watch(PSFS, psf_refinement, "mend")
     watch(LEVELS, halos, "settle_levels")
     watch(HALOS, halos, "settle_halos")

@@ -303,8 +303,7 @@ def without_replicas(outcome: Outcome, parts: Sequence[Part], seed: int) -> Boot
     stated = np.nan_to_num(in_electrons(outcome, outcome.star_errors()[0]))
     pixels = np.zeros((3, *outcome.scene.observation.sky_shape))
     none = np.zeros((0, len(quantities)))
-    is_rate = (outcome.scene.observation.exposure != 1.0).any()
-    unit = "electron/s" if is_rate else "electron"
+    unit = "electron/s" if outcome.setup.is_rate else "electron"
     return Bootstrap(quantities, none, none, pixels, width, seed, unit, stated, shares)
 
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal, NamedTuple
 
 from lnocl.core.runs.options import (
@@ -19,6 +19,7 @@ from lnocl.core.runs.options import (
     read_start,
 )
 from lnocl.core.runs.start import Setup
+from lnocl.core.scene.arrays import flag
 from lnocl.core.scene.observation import Observation
 from lnocl.core.scene.penalty import Penalty
 from lnocl.core.scene.psf_families import Family
@@ -26,7 +27,10 @@ from lnocl.core.scene.star_psfs import owned, refuse_unowned
 from lnocl.core.scene.stars import check_positions
 from lnocl.core.solvers import SolverName
 
-LEVELS, PSFS, HALOS, PRIOR, CHOICE, STARS = STEPS = (
+CORES, RAYS, EXPOSURES, LEVELS, PSFS, HALOS, PRIOR, CHOICE, STARS = STEPS = (
+    "mask saturated cores",
+    "mask cosmic rays",
+    "fit exposures to stars",
     "fit levels of backgrounds",
     "judge PSFs before the run",
     "settle halos",
@@ -52,7 +56,12 @@ class Condition(NamedTuple):
 
 
 AUTO = Condition(lambda plan: plan.smoothing == "auto", "`smoothing` is a number")
+MENDS = Condition(lambda plan: plan.mends, "`mend_images` is False")
 HAS_STARS = Condition(lambda plan: len(plan.setup.stars) > 0, "there are no stars")
+SEVERAL = Condition(lambda plan: plan.setup.observation.n_images > 1, "there is one image")
+ONE_EPOCH = Condition(
+    lambda plan: plan.setup.observation.n_epochs == 1, "stars may vary from epoch to epoch"
+)
 SHOWS_PSFS = Condition(
     lambda plan: bool((owned(plan.setup.observation, plan.setup.stars) < 0).any()),
     "all stars have PSFs of their own",
@@ -66,6 +75,9 @@ WHOLE = Condition(lambda plan: not plan.in_tiles, "the images are divided into t
 
 # What each step needs, in the order in which reasons are given.
 NEEDS: dict[str, tuple[Condition, ...]] = {
+    CORES: (AUTO, MENDS, HAS_STARS),
+    RAYS: (AUTO, MENDS),
+    EXPOSURES: (AUTO, MENDS, HAS_STARS, SEVERAL, ONE_EPOCH),
     LEVELS: (AUTO, HAS_ERROR, WHOLE),
     PSFS: (AUTO, HAS_STARS, SHOWS_PSFS),
     HALOS: (AUTO, HAS_HALOS),
@@ -104,6 +116,10 @@ class Plan:
         Whether stars are moved; "auto": where that mends a misfit.
     in_tiles : bool
         Whether it is that of `lnocl.deconvolve_tiles`.
+    mends : bool
+        Whether images may be mended before anything is fitted to them.
+    found : mapping of str
+        What steps that are done have found, in words; it is told with them.
 
     See Also
     --------
@@ -118,6 +134,9 @@ class Plan:
     >>> image[5, 8] += 100.0
     >>> obs = lnocl.Observation(np.stack([image] * 2), np.ones((3, 3)), epochs=[0, 1])
     >>> print(lnocl.plan(obs, [(8, 5)]))
+    mask saturated cores: yes
+    mask cosmic rays: yes
+    fit exposures to stars: no, stars may vary from epoch to epoch
     fit levels of backgrounds: no, backgrounds have no error
     judge PSFs before the run: yes, and fit shift, jitter, pixels
     settle halos: no, there are no halos
@@ -135,6 +154,8 @@ class Plan:
     is_asked: bool = False
     moves: bool | Literal["auto"] = False
     in_tiles: bool = False
+    mends: bool = True
+    found: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def judges_psfs(self) -> bool:
@@ -162,7 +183,7 @@ class Plan:
         where = WHERE.get(step, "")
         if where == UNLESS_WRONG and not self.does(PSFS):
             where = ""
-        return ", ".join(filter(None, ("yes", where)))
+        return ", ".join(filter(None, ("yes", where, self.found.get(step, ""))))
 
     def __str__(self) -> str:
         """Return a line for each step."""
@@ -186,6 +207,7 @@ def plan(
     initial_star_fluxes: Any = None,
     refine_positions: bool | Literal["auto"] = "auto",
     refine_psfs: Literal["auto"] | Iterable[Family] = "auto",
+    mend_images: bool = True,
 ) -> Plan:
     """Return what `lnocl.deconvolve` does with an observation; nothing is computed yet.
 
@@ -194,7 +216,7 @@ def plan(
     observation, stars
         As for `lnocl.deconvolve`.
     mu, smoothing, solver, n_iter, stop, precision, engine, device, pad, initial_extended, \
-    initial_star_fluxes, refine_positions, refine_psfs
+    initial_star_fluxes, refine_positions, refine_psfs, mend_images
         As for `lnocl.deconvolve`.
 
     Returns
@@ -222,6 +244,7 @@ def plan(
     check_observation(observation)
     check_choices(solver, precision, engine, device)
     check_length(n_iter, stop)
+    mends = flag("mend_images", mend_images)
     refine_positions = read_refine_positions(refine_positions)
     fits_stars = solver == "sgp" or refine_positions is True
     positions = check_positions(stars, observation)
@@ -231,7 +254,7 @@ def plan(
     smoothing = read_smoothing(smoothing)
     Penalty(mu, 0.0 if isinstance(smoothing, str) else smoothing)  # refuses what is out of range
     setup = Setup(observation, positions, pad, solver, precision, engine, device, False, *initial)
-    made = Plan(setup, mu, smoothing, int(n_iter), stop)
+    made = Plan(setup, mu, smoothing, int(n_iter), stop, mends=mends)
     is_auto = made.does(PSFS)
     showing = positions[owned(observation, positions) < 0]
     families = check_families(refine_psfs, observation, showing, refine_positions, is_auto)

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
 from lnocl.core.runs.options import StopName
 from lnocl.core.runs.outcome import Mended, PsfRefinement
-from lnocl.core.runs.plan import LEVELS, PSFS, Plan
+from lnocl.core.runs.plan import CORES, EXPOSURES, LEVELS, PSFS, RAYS, Plan
 from lnocl.core.runs.progress import Progress
 from lnocl.core.runs.start import Setup
 from lnocl.core.runs.steady import STEADY, steady_penalty
@@ -46,6 +46,8 @@ class Prepared:
         The outcome for PSFs that were judged.
     fits : bool
         Whether PSFs were judged, and fit.
+    found : mapping of str
+        What steps of the plan have found, in words.
     """
 
     setup: Setup
@@ -55,6 +57,7 @@ class Prepared:
     steady: Penalty | None = None
     refinement: PsfRefinement | None = None
     fits: bool = False
+    found: Mapping[str, str] = field(default_factory=dict)
 
     def of(self, observation: Observation, stars: Array, **changes: Any) -> Prepared:
         """Return this run of another observation, with other stars; `changes` are of the setup."""
@@ -75,7 +78,7 @@ def quietly() -> np.errstate:
 
 def prepare(plan: Plan, progress: bool = False) -> Prepared:
     """Return the run of a plan, after levels are fitted and PSFs and positions judged."""
-    setup = plan.setup
+    setup, found = _mend_images(plan)
     if plan.does(LEVELS):
         from lnocl.core.runs.halos import settle_levels  # which loads scipy
 
@@ -88,7 +91,23 @@ def prepare(plan: Plan, progress: bool = False) -> Prepared:
     if are_wrong and stop == "held-out":  # which shares their error, and chooses too little
         stop = CONVERGED
     steady, fits = steady_penalty(penalties), is_auto and mended.fits
-    return Prepared(mended.setup, penalties, plan.n_iter, stop, steady, mended.refinement, fits)
+    refinement = mended.refinement
+    return Prepared(mended.setup, penalties, plan.n_iter, stop, steady, refinement, fits, found)
+
+
+def _mend_images(plan: Plan) -> tuple[Setup, dict[str, str]]:
+    """Return the setup of a plan with images mended, and in words what was."""
+    from lnocl.core.runs import mends  # which loads scipy
+
+    steps = {
+        CORES: mends.mask_cores,
+        RAYS: mends.mask_rays,
+        EXPOSURES: mends.fit_exposures,
+    }
+    setup, found = plan.setup, dict[str, str]()
+    for step in filter(plan.does, steps):
+        setup, found[step] = steps[step](setup)
+    return setup, found
 
 
 def _judge_psfs(plan: Plan, setup: Setup, progress: bool) -> Mended:

@@ -24,9 +24,11 @@ from lnocl.core.runs.psf_allowance import STRENGTH, Allowance
 from lnocl.core.runs.start import Setup
 from lnocl.core.scene.arrays import Array
 from lnocl.core.scene.psf_families import PsfFamilies, PsfParameters
+from lnocl.core.scene.psf_faults import name_faults
 from lnocl.core.scene.psf_field import Psfs, mapped
 from lnocl.core.scene.psf_misfit import PsfMisfit
 from lnocl.core.scene.psf_wings import without_noise
+from lnocl.core.scene.star_psfs import owned
 from lnocl.core.solvers.psf_fit import step
 from lnocl.errors import counted, note, warn
 
@@ -160,7 +162,7 @@ def mend(
         left is not None,
         state.misfit.hidden if state is not given else 0.0,
     )
-    _warn(refinement)
+    _warn(refinement, setup)
     # Replicas draw PSFs from it, so that the errors of regions contain that of the PSFs.
     if not len(known) and len(scatter := allowance.scatter()):
         observation = observation.replace(psf_scatter=scatter)
@@ -323,15 +325,22 @@ def _tell(given: _State, state: _State, tried: _State, done: Sequence[str]) -> N
         note(f"the misfit of the PSFs is {before:.3g}, where noise gives 1")
 
 
-def _warn(refinement: PsfRefinement) -> None:
+def _warn(refinement: PsfRefinement, setup: Setup) -> None:
+    seen = setup.stars[owned(setup.observation, setup.stars) < 0]
     if refinement.has_free_pixels and refinement.psf_error > FIRST_ERROR:
         warn(
             f"the PSFs given do not fit the stars, by {100 * refinement.psf_error:.0f} %, and "
-            "their pixels were fitted there: see whether they are of these images, and sampled "
-            "alike"
+            "their pixels were fitted there: "
+            + (
+                name_faults(setup.observation, seen)
+                or "see whether they are of these images, and sampled alike"
+            )
         )
     if not refinement.has_free_pixels and refinement.psf_error > NOTABLE:
         warn(
-            f"the PSFs do not fit the stars, by {100 * refinement.psf_error:.2g} %: trust nothing "
-            "fainter than this near the stars"
+            f"the PSFs do not fit the stars, by {100 * refinement.psf_error:.2g} %: "
+            + (
+                name_faults(setup.observation, seen)
+                or "trust nothing fainter than this near the stars"
+            )
         )

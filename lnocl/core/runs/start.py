@@ -26,7 +26,8 @@ class Setup:
     """The observation and the parameters that all runs of one call of `deconvolve` share.
 
     Attributes are the arguments of `deconvolve`, checked; `stars` are the positions as given, and
-    `settles_halos` whether halos are held at what `lnocl.core.runs.halos` finds.
+    `settles_halos` whether halos are held at what `lnocl.core.runs.halos` finds. `in_time` is
+    whether exposures were given, where those of the observation were changed.
     """
 
     observation: Observation
@@ -40,6 +41,13 @@ class Setup:
     initial_extended: Array | None = None
     initial_star_fluxes: Array | None = None
     settles_halos: bool = False
+    in_time: bool | None = None
+
+    @property
+    def is_rate(self) -> bool:
+        """Whether the sky is per unit of time, as exposures were given."""
+        given = self.in_time
+        return bool((self.observation.exposure != 1.0).any()) if given is None else given
 
     def scene(self, penalty: Penalty) -> Scene:
         """Return the model of the observation, with the stars where they were given."""

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from itertools import product
 
 import numpy as np
 from scipy import ndimage
 
 from lnocl.core.scene.arrays import Array, Mask
+from lnocl.core.scene.cores import core
 from lnocl.core.scene.shifting import ENDLESS, MovablePsf
 
 # The pairs of pixels on both sides of one: beside it, above and below, and across.
@@ -18,6 +19,10 @@ DIRECTIONS = ((0, 1), (1, 0), (1, 1), (1, -1))
 SHARE, CLEAR = 0.3, 4.0
 # The charge of a cosmic ray spreads to those beside it that are above the sky by so many.
 SPREAD = 2.0
+# A core is what is connected to a PSF's peak above this share of it; light beyond it that may be as
+# much as this share of a sharp pixel makes that. So many adjoining bad pixels may hide a source, so
+# many times as bright as all others.
+CORE, RING, HIDING, HIDDEN = 0.1, 0.5, 5, 1e3
 # Where in its pixel a star may lie, along each axis.
 PLACES = (-0.5, -0.25, 0.0, 0.25, 0.5)
 # So many adjoining pixels, or so many in all with the largest value of the frame, are a flat top,
@@ -53,6 +58,18 @@ def sharp_pixels(
         Whether the image is of whole counts, each of which may be a photon.
     """
     shares = np.min([_least_shares(psf) for psf in psfs], axis=0)
+    return _sharp(light, noise, bad, shares, are_counts, np.zeros_like)
+
+
+def _sharp(
+    light: Array,
+    noise: Array,
+    bad: Mask,
+    shares: Array,
+    are_counts: bool,
+    but: Callable[[Mask], Mask],
+) -> Mask:
+    """Return sharp pixels by the share of light beside them, but those that `but` leaves out."""
     sharp, is_bright = np.zeros(bad.shape, bool), light > SPREAD * noise
     light = light.clip(0.0)  # beside a hole all is sharp
     while True:
@@ -64,9 +81,56 @@ def sharp_pixels(
             error = np.sqrt(_beside(variance, direction) + share**2 * variance)
             are_known = is_known & (_beside(is_known.astype(float), direction) == 2)
             new |= are_known & (pair < SHARE * expected) & (expected - pair > CLEAR * error)
+        new &= ~but(new)
         if not new.any():
             return sharp
         sharp |= new | (ndimage.binary_dilation(new, np.ones((3, 3))) & is_bright)
+
+
+def cosmic_rays(light: Array, noise: Array, bad: Mask, psfs: Sequence[Array]) -> Mask:
+    """Return where an image is sharper than its PSF, as `sharp_pixels`, and is no ring of a star.
+
+    A pixel is left out where something brighter, farther from it than the core of a PSF, may shed
+    half its light there; of what large groups of bad pixels hide that is always taken. The PSFs may
+    be narrower than those given, by about 0.7, as the squares of the shares are.
+
+    Parameters
+    ----------
+    light, noise, bad, psfs
+        As for `sharp_pixels`; PSFs are of one shape. The image may be of whole counts.
+    """
+    holes, _ = ndimage.label(bad, np.ones((3, 3)))
+    is_hidden = (np.bincount(holes.ravel()) >= HIDING)[holes] & bad
+    lobes = np.max([_lobes(psf, max(light.shape)) for psf in psfs], axis=0)
+    half = lobes.shape[0] // 2
+
+    def is_shed(new: Mask) -> Mask:
+        """Return which of new sharp pixels may be light of something brighter."""
+        sources = np.where(new | bad, 0.0, light.clip(0.0))
+        sources[is_hidden] = HIDDEN * sources.max()
+        padded, shed = np.pad(sources, half), np.zeros(bad.shape, bool)
+        for y, x in np.argwhere(new):
+            there = padded[y : y + 2 * half + 1, x : x + 2 * half + 1]
+            shed[y, x] = (there * lobes).max() > RING * light[y, x]
+        return shed
+
+    shares = np.min([_least_shares(psf) for psf in psfs], axis=0) ** 2 / 2.0
+    return _sharp(light, noise, bad, shares, True, is_shed)
+
+
+def _lobes(psf: Array, most: int) -> Array:
+    """Return the light of a PSF beyond its core over its peak, as sources see it that shed it.
+
+    Shape (n, n), at most `most` pixels to each side; each value is the largest of the next pixels.
+    """
+    half = min(max(psf.shape) // 2 + 1, most)
+    whole = np.zeros((2 * max(psf.shape) + 3,) * 2)
+    first = whole.shape[0] // 2 - np.array(psf.shape) // 2
+    whole[first[0] : first[0] + psf.shape[0], first[1] : first[1] + psf.shape[1]] = psf / psf.max()
+    of_core = ndimage.binary_dilation(core(whole, CORE), np.ones((3, 3)))
+    beyond = ndimage.maximum_filter(np.where(of_core, 0.0, whole), 3)[::-1, ::-1]
+    middle = whole.shape[0] // 2
+    return beyond[middle - half : middle + half + 1, middle - half : middle + half + 1]
 
 
 def _beside(values: Array, direction: tuple[int, int]) -> Array:

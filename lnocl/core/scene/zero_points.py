@@ -1,0 +1,153 @@
+"""Zero points of images: by what factor all stars are brighter in one image than in others.
+
+Light is summed in circles round each star, the mean of a ring taken off, and divided by the same of
+its PSF. The ratio of two images then hardly hangs on the shapes of PSFs, and not on what lies under
+the star. Circles of three sizes tell a zero point, which all have, from a PSF that is wrong, and
+from light beside the star, such as a cosmic ray, that one image has.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from lnocl.core.scene.arrays import Array
+from lnocl.core.scene.cores import fwhm
+from lnocl.core.scene.detector import seen_psfs
+from lnocl.core.scene.scene import Scene
+
+# Radii of the circles and of the ring, in the widths of the widest PSF, and pixels at least.
+CIRCLES, RING, LEAST_WIDTH = (0.7, 1.5, 2.5), (3.0, 4.5), 1.5
+# Stars with this relative error at most are used, the brightest; more than this is not known of
+# each, which may vary a little.
+FAINTEST, MOST_STARS, SYSTEMATIC = 0.1, 100, 0.005
+# Bad pixels may hold this share of a star's light, and leave so much of the ring.
+HIDDEN, LEFT = 0.05, 0.5
+# A zero point is used that is more than this, so many times its error, and the same in all circles
+# but for these shares, in the least and the largest beside the other, or so many errors.
+LEAST, SIGNIFICANT, ALIKE, APART = 0.03, 4.0, (0.5, 0.25), 3.0
+
+
+class ZeroPoints(NamedTuple):
+    """Natural logarithms of the factors of images, relative to the one in the middle.
+
+    Attributes
+    ----------
+    values, errors : ndarray of float64, shape (p,)
+        NaN where an image shows no star well.
+    n_stars : int
+        Stars that they are measured on.
+    """
+
+    values: Array
+    errors: Array
+    n_stars: int
+
+
+def zero_points(scene: Scene) -> ZeroPoints | None:
+    """Return the zero points that are used, 0 where none is; None where no image has one."""
+    measured = [_measured(scene, radius) for radius in CIRCLES]
+    found = [each for each in measured if each is not None]
+    if len(found) < len(CIRCLES):
+        return None
+    core, middle, large = found
+    with np.errstate(invalid="ignore"):
+        is_used = np.ones(scene.n_images, bool)
+        for each in (middle, large):
+            is_used &= abs(each.values) > np.maximum(LEAST, SIGNIFICANT * each.errors)
+        for each, share in zip((core, large), ALIKE, strict=True):
+            apart = APART * np.hypot(each.errors, middle.errors)
+            change = abs(each.values - middle.values)
+            is_used &= change < np.maximum(share * abs(middle.values), apart)
+    if not is_used.any():
+        return None
+    return middle._replace(values=np.where(is_used, middle.values, 0.0))
+
+
+def _measured(scene: Scene, radius: float) -> ZeroPoints | None:
+    """Return the zero points in circles of so many widths; None where no star shows two."""
+    fluxes, variances = _photometry(scene, radius)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        relative = np.sqrt(variances) / fluxes
+        is_good = (fluxes > 0) & (relative < FAINTEST)
+    is_good[:, is_good.sum(axis=0) < 2] = False
+    brightest = np.argsort(np.where(is_good, relative, np.inf).min(axis=0))[:MOST_STARS]
+    stars = brightest[is_good[:, brightest].any(axis=0)]
+    if not len(stars):
+        return None
+    is_good = is_good[:, stars]
+    logs = np.log(np.where(is_good, fluxes[:, stars], np.nan))
+    errors = np.where(is_good, np.hypot(relative[:, stars], SYSTEMATIC), np.nan)
+    values = np.zeros(len(logs))
+    for _ in range(10):  # stars and images in turn
+        of_stars = np.nanmedian(logs - values[:, None], axis=0)
+        found = [_middle(each - of_stars, error) for each, error in zip(logs, errors, strict=True)]
+        values = np.array([each[0] for each in found])
+    return ZeroPoints(
+        values - np.nanmedian(values), np.array([each[1] for each in found]), len(stars)
+    )
+
+
+def _middle(values: Array, errors: Array) -> tuple[float, float]:
+    """Return the weighted median of values that are not NaN, and its error by noise and scatter."""
+    known = np.isfinite(values)
+    values, weights = values[known], errors[known] ** -2.0
+    n = len(values)
+    if not n:
+        return np.nan, np.nan
+    order = np.argsort(values)
+    share = np.cumsum(weights[order]) - weights[order] / 2.0
+    middle = float(np.interp(weights.sum() / 2.0, share, values[order]))
+    if n < 3:
+        return middle, float(weights.sum() ** -0.5)
+    scatter = 1.4826 * float(np.median(abs(values - middle))) * np.sqrt(np.pi / 2.0 / n)
+    return middle, max(np.sqrt(np.pi / 2.0 / weights.sum()), scatter)
+
+
+def _photometry(scene: Scene, radius: float) -> tuple[Array, Array]:
+    """Return fluxes and their variances, shape (p, n_stars); NaN where an image has none."""
+    psfs, scales = seen_psfs(scene.observation), scene.observation.scales
+    width = max(fwhm(psf) * scale for psf, scale in zip(psfs, scales, strict=True))
+    found = np.full((scene.n_images, scene.n_stars, 2), np.nan)
+    for j, scale in enumerate(scales):
+        unit = max(width, LEAST_WIDTH) / scale
+        for s in np.flatnonzero(scene.shown[: scene.n_stars, j] & (scene.owned < 0)).tolist():
+            found[j, s] = _of_star(scene, j, s, radius, unit)
+    return found[..., 0], found[..., 1]
+
+
+def _of_star(scene: Scene, j: int, s: int, radius: float, unit: float) -> tuple[float, float]:
+    """Return the flux of a star in an image and its variance; NaN where too little is seen of it.
+
+    The radius is in units of so many pixels.
+    """
+    observation, (x, y) = scene.observation, scene.star_field.places[j][s]
+    reach, (ny, nx) = int(np.ceil(RING[1] * unit)), observation.shape
+    edge = min(x, y, nx - 1 - x, ny - 1 - y)
+    if edge < radius * unit - 0.5:
+        return np.nan, np.nan
+    rows, columns = (
+        slice(max(round(at) - reach, 0), min(round(at) + reach + 1, n))
+        for at, n in ((y, ny), (x, nx))
+    )
+    there, first = (j, rows, columns), (rows.start, columns.start)
+    counts, good = observation.images[there], ~observation.mask[there]
+    background = observation.background
+    light = counts - (background[there] if background.ndim == 3 else background[j])
+    star = scene.star_cutout(j, s).add_to(np.zeros(good.shape), first, scene.image_grid)
+    if observation.exposure.ndim == 3:
+        star = star * observation.exposure[there]
+    v, u = np.indices(good.shape)
+    distance = np.hypot(v + first[0] - y, u + first[1] - x) / unit
+    circle, ring = distance <= radius, good & (distance > RING[0]) & (distance <= RING[1])
+    n_ring, n_whole = np.count_nonzero(ring), np.pi * np.diff(np.square(RING)).item() * unit**2
+    is_hidden = star[circle & ~good].sum() > HIDDEN * star[circle].sum()
+    if is_hidden or n_ring < LEFT * n_whole:
+        return np.nan, np.nan
+    circle &= good
+    weights = circle - ring * (np.count_nonzero(circle) / n_ring)
+    of_psf = float((weights * star).sum())
+    if not of_psf > 0:
+        return np.nan, np.nan
+    return float((weights * light).sum()) / of_psf, float((weights**2 * counts).sum()) / of_psf**2

@@ -1,0 +1,87 @@
+"""Zero points of images are told by their stars, and wrong PSFs are not taken for them."""
+
+import numpy as np
+import pytest
+from test_saturation import lopsided
+
+import lnocl
+from lnocl.core.scene.scene import Scene
+from lnocl.core.scene.zero_points import zero_points
+
+SHAPE, LEVEL = (60, 64), 50.0
+STARS = np.array([(22.3, 36.8), (41.7, 24.1)])
+WIDTHS, FACTORS = (2.6, 3.0, 3.4), np.array([0.7, 1.0, 1.1])
+
+
+def observe(factors=FACTORS, flux=4e4, seed=0, psf_widths=WIDTHS, exposure=1.0, q=1, **known):
+    """Return images of two stars on a host of the first, and of other widths each."""
+    chance, images = np.random.default_rng(seed), []
+    maps = known.get("transforms", np.tile(np.eye(2, 3), (len(WIDTHS), 1, 1)))
+    dims = np.broadcast_to(exposure, (len(WIDTHS), *SHAPE)) if np.ndim(exposure) > 1 else exposure
+    for j, width in enumerate(WIDTHS):
+        places = STARS @ maps[j][:, :2].T + maps[j][:, 2]
+        light = sum(
+            c * lopsided(*at, SHAPE, width) for c, at in zip((1.0, 0.5), places, strict=True)
+        )
+        light += 2.0 * lopsided(*places[0], SHAPE, np.hypot(width, 4.0))
+        dim = factors[j] * (dims[j] if np.ndim(dims) else dims)
+        images.append(chance.poisson(LEVEL + dim * flux * light))
+    n = 20 * q
+    psfs = [lopsided(n, n, (2 * n + 1, 2 * n + 1), q * width) for width in psf_widths]
+    given = {} if np.ndim(exposure) == 0 else {"exposure": exposure}
+    return lnocl.Observation(images, psfs, background=LEVEL, oversample=q, **given, **known)
+
+
+RAMP = np.linspace(0.5, 1.5, SHAPE[1]) * np.ones((3, *SHAPE))
+KINDS = {
+    "plain": {},
+    "exposures": {"exposure": [10.0, 3.0, 5.0], "flux": 1e4},
+    "maps of exposures": {"exposure": RAMP},
+    "turned": {"transforms": lnocl.rotations([0.0, 25.0, 50.0], (31.0, 30.0))},
+    "a finer sky": {"q": 2},
+}
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_a_zero_point_is_told_in_images_of_every_kind(name):
+    observation = observe(**KINDS[name])
+    found = zero_points(Scene(observation, STARS))
+    assert found.n_stars == 2
+    expected = np.log(FACTORS / np.median(FACTORS))
+    assert (np.abs(found.values - expected) < 3.0 * found.errors).all()
+    assert (found.errors < 0.015).all()
+    assert found.values[1] == 0.0
+
+
+RIGHT = {
+    "right": {},
+    "faint": {"flux": 300.0, "factors": [0.8, 1.0, 1.1]},
+    "a PSF too narrow": {"psf_widths": (2.1, 3.0, 3.4), "flux": 4e6},
+    "a PSF too wide": {"psf_widths": (2.6, 3.6, 3.4), "flux": 4e6},
+    "exposures": {"exposure": [10.0, 3.0, 5.0]},
+}
+
+
+@pytest.mark.parametrize("name", RIGHT)
+@pytest.mark.parametrize("seed", range(3))
+def test_there_is_none_where_the_images_do_not_tell_it(name, seed):
+    observation = observe(**{"factors": np.ones(3), **RIGHT[name]}, seed=seed)
+    assert zero_points(Scene(observation, STARS)) is None
+
+
+def test_a_star_that_varies_and_masked_ones_do_not_matter_beside_others():
+    y, x = np.indices((100, 100))
+    stars = np.array([(25.2, 24.0), (75.0, 26.4), (50.7, 50.1), (24.6, 75.3), (76.0, 74.0)])
+    images = []
+    for j, factor in enumerate((0.8, 1.0, 1.0)):
+        fluxes = np.full(5, 5e4)
+        fluxes[1] *= (3.0, 1.0, 0.2)[j]
+        light = sum(c * lopsided(*at, x.shape) for c, at in zip(fluxes, stars, strict=True))
+        images.append(np.random.default_rng(j).poisson(LEVEL + factor * light))
+    mask = np.hypot(x - stars[2, 0], y - stars[2, 1]) < 2.0
+    psf = lopsided(20, 20, (41, 41))
+    scene = Scene(lnocl.Observation(images, psf, background=LEVEL, mask=mask), stars)
+    found = zero_points(scene)
+    assert found.n_stars == 4
+    assert found.values[0] == pytest.approx(np.log(0.8), abs=3.0 * found.errors[0])
+    assert (found.values[1:] == 0.0).all()
