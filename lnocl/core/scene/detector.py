@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
+from copy import copy
 from typing import Any
 
 import numpy as np
@@ -103,6 +104,15 @@ class DetectorPsf:
         # From the middle of a pixel to the first of its fine pixels, in these.
         self._half = (oversample - 1) / 2.0
         self._lag = self._half if is_effective else 0.0
+
+    def changed(self, function: Callable[[Array], Iterable[Array]]) -> list[DetectorPsf]:
+        """Return what a function makes of the PSF, seen by the same pixels."""
+        others = []
+        for fine in self.fine.changed(function):
+            other = copy(self)
+            other.fine = fine
+            others.append(other)
+        return others
 
     def response(self, x: float, y: float) -> Cutout:
         """Return h on the fine grid, the sky moved by so many pixels of the image."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -147,6 +147,10 @@ class MovablePsf:
     def fine(self) -> MovablePsf:
         """The PSF on the pixels of the sky."""
         return self
+
+    def changed(self, function: Callable[[Array], Iterable[Array]]) -> list[MovablePsf]:
+        """Return what a function makes of the PSF, to be placed alike."""
+        return [MovablePsf(psf, self._grid) for psf in function(self._psf)]
 
     def on_sky(self, x: float, y: float) -> Cutout:
         """Return the PSF at a position."""
