@@ -16,6 +16,10 @@ os.environ.setdefault(
 # Before NumPy is imported: the test processes are as many as the processors.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
+from lnocl.core.scene.fields import PSF_ERROR
+from lnocl.core.scene.observation import Observation
+from lnocl.io.calibration import Calibration
+
 if size := os.environ.get("LNOCL_TEST_LOCAL_MEMORY"):
     import pyopencl as cl
 
@@ -31,6 +35,22 @@ for profile, examples in {"fast": 5, "exhaustive": 20}.items():
 def pytest_configure(config):
     fast = "not exhaustive" in config.option.markexpr
     settings.load_profile("fast" if fast else "exhaustive")
+
+
+def _take_psf_error(error):
+    """Have observations, and files that are read, PSFs of another error by default."""
+    Observation.__init__.__kwdefaults__["psf_error"] = error
+    defaults = Calibration._field_defaults | {"psf_error": error}
+    Calibration.__new__.__defaults__ = tuple(defaults.values())
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_setup(item):
+    """Have PSFs of tests exact, as those of simulations are; documentation has the default.
+
+    Tests of PSFs that are not exact give `psf_error`.
+    """
+    _take_psf_error(PSF_ERROR if isinstance(item, pytest.DoctestItem) else 0.0)
 
 
 @pytest.fixture(scope="module")

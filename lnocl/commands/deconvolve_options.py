@@ -117,6 +117,15 @@ OPTIONS = {
             card=("REFPSF", "asked of the PSFs"),
         ),
         parameter(
+            Observation,
+            "psf_error",
+            default=None,
+            type=float,
+            metavar="SHARE",
+            needs=("stars", "star_table"),
+            card=("PSFPRIOR", "relative error that PSFs may have"),
+        ),
+        parameter(
             Calibration,
             "psf_errors",
             kinds=PSF_ERRORS,

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Literal, NamedTuple
 
+from lnocl.core.scene.fields import PSF_ERROR
 from lnocl.core.scene.observation import PsfCentre
 
 Word = str | float
@@ -69,7 +70,7 @@ class Calibration(NamedTuple):
         Epochs of the images, in each of which a star has a flux of its own, as a quasar that
         varies: each, for one an image; a keyword of their headers such as DATE-OBS; or a label for
         each image (default: one epoch).
-    oversample, effective_psfs, psf_centre
+    oversample, effective_psfs, psf_centre, psf_error
         As for `Observation`.
     psf_errors : sequence of str
         FITS files of the shape of the PSFs that tell how these may be wrong: ideal=FILE, a PSF
@@ -103,6 +104,7 @@ class Calibration(NamedTuple):
     oversample: int = 1
     effective_psfs: bool = False
     psf_centre: PsfCentre = "check"
+    psf_error: float = PSF_ERROR
     psf_errors: Sequence[str] = ()
     halos: Sequence[str] = ()
     star_psfs: Sequence[str] = ()

@@ -143,6 +143,7 @@ class _Reader:
             oversample=self._calibration.oversample,
             effective_psfs=self._calibration.effective_psfs,
             psf_centre=self._calibration.psf_centre,
+            psf_error=self._calibration.psf_error,
             **self._psf_errors(),
             **self._star_psfs(),
             halos=self._halos(),

@@ -182,6 +182,7 @@ NEEDED = {
     "deconvolve i.fits --psf p.fits -o o.fits --centre 3,4": "--angle",
     "deconvolve i.fits --psf p.fits -o o.fits --epoch each": "--star or --stars",
     "deconvolve i.fits --psf p.fits -o o.fits --refine": "--star or --stars",
+    "deconvolve i.fits --psf p.fits -o o.fits --psf-error 0.02": "--star or --stars",
     "deconvolve i.fits --psf p.fits -o o.fits --psf-errors ideal=d.fits": "--star or --stars",
     "deconvolve i.fits --psf p.fits -o o.fits --star-psf 1,2=q.fits": "--star or --stars",
     "limit r.fits --injections 0 --seed 3": "--injections",

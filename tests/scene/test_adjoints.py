@@ -233,7 +233,7 @@ def test_the_sky_round_a_star(kind, monkeypatch):
     source, shape = near.source, near.expected.shape
     assert shape != scene.grid
     x, y = abs(noise(*shape)), noise(P, *near.window.shape, seed=4)
-    weights = np.array([each.precision > 0 for each in near._images])
+    weights = np.array([each.precision > 0 for each in near.images])
     assert_adjoint(source.images_of, source._adjoint, x, y * weights)
     laid = np.zeros(scene.grid)
     laid[near.places(scene)] = x

@@ -488,7 +488,11 @@ def test_the_arrays_of_an_observation_are_read_only(maps):
     given = {name: np.full(shape, value) if maps else value for name, value in given.items()}
     observation = lnocl.Observation(np.ones(shape), np.ones((1, 1)), **given)
     names = arrays_of(observation)
-    assert set(names) == {*FIELDS, "offsets", "turns"} - {"oversample", "effective_psfs"}
+    assert set(names) == {*FIELDS, "offsets", "turns"} - {
+        "oversample",
+        "effective_psfs",
+        "psf_error",
+    }
     for name in names:
         with pytest.raises(ValueError, match="read-only"):
             getattr(observation, name)[...] = 0
@@ -571,6 +575,7 @@ PUPIL = np.pad(np.ones((2, 2)), 1)[:3, :3]
 TURNED = lnocl.rotations([0.0, 30.0], (4, 3))
 # Wrong values of each parameter that replace takes; images are of 8 rows, and 9 columns.
 WRONG = {
+    "psf_error": [-0.01, 0.31, np.nan, [0.1, 0.2], "x"],
     "images": [
         np.ones((8, 9), complex),
         [[1.0], [2.0, 3.0]],

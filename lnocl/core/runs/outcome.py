@@ -290,10 +290,10 @@ class Outcome:
     def star_errors(self) -> tuple[Array, Array]:
         """Return the standard errors of fluxes and positions, the extended source not known.
 
-        Fluxes are those of stars and halos. `lnocl.core.solvers.star_errors` has the equation. The
-        relative error that the PSFs still have is that of each star's flux too, added in
-        quadrature. NaN for positions that were not fitted, and where the images do not determine
-        them.
+        Fluxes are those of stars and halos. `lnocl.core.solvers.star_errors` has the equation. Of
+        PSFs that are said to be exact, and are not, the relative error that is left is that of each
+        star's flux too, added in quadrature. NaN for positions that were not fitted, and where the
+        images do not determine them.
 
         Warns
         -----
@@ -311,7 +311,9 @@ class Outcome:
         _warn_of_undetermined(scene.stars[is_lost], bool(np.isnan(halos.errors).any()))
         if self.psf_refinement is not None:
             refinement = self.psf_refinement
-            of_psfs = np.hypot(refinement.psf_error, refinement.hidden_error)
+            # Else what PSFs may have wrong is among the unknowns.
+            left = refinement.psf_error * (self.scene.observation.psf_error == 0)
+            of_psfs = np.hypot(left, refinement.hidden_error)
             errors[:, 0] = np.hypot(errors[:, 0], of_psfs * star_fluxes)
         positions = errors[:, 1:]
         positions[positions > MAX_SHIFT] = np.nan  # no star is moved farther

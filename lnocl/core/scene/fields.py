@@ -38,6 +38,10 @@ if TYPE_CHECKING:
 OVERSAMPLES = 1, 2, 4
 
 
+# What real PSFs have, and the most that may be said of them.
+PSF_ERROR, MOST_PSF_ERROR = 0.03, 0.3
+
+
 class Given:
     """What is given of an observation, without units.
 
@@ -131,6 +135,16 @@ def _oversample(_: Field, value: Any, held: Observation) -> int:
 
 def _flag(field: Field, value: Any, held: Observation) -> bool:
     return flag(field.name, value)
+
+
+def _psf_error(field: Field, value: Any, held: Observation) -> float:
+    error = numbers(field.name, value)
+    if error.ndim or not 0 <= error <= MOST_PSF_ERROR:
+        raise InputError(
+            f"`{field.name}` must be a number from 0 to {MOST_PSF_ERROR:g}, the standard error of "
+            f"the width of the PSFs over that; {value} was given"
+        )
+    return float(error)
 
 
 def _images(field: Field, value: Any, held: Observation) -> Array:
@@ -277,6 +291,7 @@ FIELDS = {
         Field("ideal_psfs", read_ideal_psfs, "", "psf"),
         Field("psf_modes", read_pixels, "", "psf"),
         Field("psf_scatter", read_pixels, "", "psf"),
+        Field("psf_error", _psf_error),
         Field("star_places", read_star_places),
         Field("star_psfs", read_star_psfs, "", "psf", of_images=1),
         Field("epochs", _epochs),

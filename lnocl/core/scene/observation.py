@@ -13,7 +13,14 @@ from numpy.typing import ArrayLike, NDArray
 from lnocl.core.scene.arrays import Array, together
 from lnocl.core.scene.containers import variances
 from lnocl.core.scene.counts import refuse_overflow, without_negative
-from lnocl.core.scene.fields import FIELDS, hold, in_one_shape, noise_beyond_counts, refuse_all_bad
+from lnocl.core.scene.fields import (
+    FIELDS,
+    PSF_ERROR,
+    hold,
+    in_one_shape,
+    noise_beyond_counts,
+    refuse_all_bad,
+)
 from lnocl.core.scene.geometry import MOVES, Box, Geometry, good_box
 from lnocl.core.scene.halos import refuse_dark
 from lnocl.core.scene.psf_field import PsfField, Psfs
@@ -132,6 +139,13 @@ class Observation:
     psf_scatter : array_like, shape (p, ky, kx) or (ky, kx), optional
         Standard deviation of the pixels of the PSFs, as far as it is known, zero or more, in units
         of PSFs of unit sum. It serves the noise near stars, and ``refine_psfs`` "pixels".
+    psf_error : float, optional
+        Relative error that the PSFs may have in their width, one standard deviation, 0 to 0.3;
+        0 for exact PSFs, as in simulations. What else they may have wrong follows it
+        (`lnocl.core.solvers.psf_errors`): blur along each axis, wings, shifts, single pixels, zero
+        points of images. All of it is in the errors of stars, and what these show of it is taken
+        into the PSFs of the reconstruction. By default 0.03, as real PSFs have
+        (:doc:`/validation/psf_priors`).
     star_psfs : array_like, shape (n, p, ky, kx), (p, ky, kx) or (ky, kx), optional
         PSFs of their own of the stars at `star_places`, such as one behind the mask of a
         coronagraph. All else has `psfs`: other stars, the extended source and what is tested. They
@@ -175,6 +189,8 @@ class Observation:
         As given.
     effective_psfs : bool
         As given.
+    psf_error : float
+        As given.
     ideal_psfs, pupils, psf_scatter : ndarray of float64, shape (p, ky, kx) or (0, ky, kx)
         As given; of length 0 where they were not.
     psf_modes : ndarray of float64, shape (p, n, ky, kx)
@@ -197,6 +213,7 @@ class Observation:
           the sum of a PSF is more than 1.
         - Images or background exceed 1e30 electrons in a pixel, with exposure and read noise.
         - No good pixel is left, or an offset leaves nothing of an image.
+        - `psf_error` is not from 0 to 0.3.
         - A halo is 0 on all good pixels of an image.
         - `transmission` is not of the sky's shape, out of range, or 0 everywhere in the images that
           have good pixels.
@@ -244,6 +261,7 @@ class Observation:
     ideal_psfs: Array
     psf_modes: Array
     psf_scatter: Array
+    psf_error: float
     star_places: Array
     star_psfs: Array
     epochs: NDArray[np.intp]
@@ -278,6 +296,7 @@ class Observation:
         pupils: ArrayLike | None = None,
         psf_modes: ArrayLike | None = None,
         psf_scatter: ArrayLike | None = None,
+        psf_error: float = PSF_ERROR,
         star_psfs: ArrayLike | None = None,
         star_places: ArrayLike | None = None,
     ) -> None:

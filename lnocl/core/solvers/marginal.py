@@ -8,7 +8,8 @@ step of Newton to where the least squares of `lnocl.core.solvers.near_star` have
 
 in which the extended source is expected to go on under the star as it falls round it
 (`lnocl.core.scene.texture`). It takes the light that the same step gives it in the core of the
-star, but no more than the star has lost or won.
+star, but no more than the star has lost or won. PSFs are held: what they may have wrong is in the
+errors of stars (`lnocl.core.solvers.star_errors`), with what it would move their fluxes by.
 """
 
 from __future__ import annotations
@@ -41,7 +42,7 @@ def marginal(estimate: Estimate) -> Estimate:
         That after the step. A star without light, or that the images do not determine, stays.
     """
     scene, star_fluxes = estimate.scene, estimate.star_fluxes
-    around = Surroundings(estimate, False)
+    around = Surroundings(estimate, False, holds_psfs=True)
     after, fluxes = estimate.sky.copy(), star_fluxes.copy()
     n_epochs = scene.observation.n_epochs
     for first in range(0, scene.n_stars, n_epochs):
@@ -54,7 +55,7 @@ def marginal(estimate: Estimate) -> Estimate:
         is_free = np.isfinite(variances(near.fit.information)[at]) & (star_fluxes[star] > 0)
         if not is_free.any():
             continue
-        change, (x, _) = near.fit.solve()
+        change, (x, *_) = near.fit.solve()
         moved = np.maximum(star_fluxes[star] + change[at] * scene.unit, 0.0)
         fluxes[star] = np.where(is_free, moved, star_fluxes[star])
         there = near.places(scene)

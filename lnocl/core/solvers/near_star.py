@@ -4,6 +4,11 @@ The extended source is a field of the covariance that `lnocl.core.scene.texture`
 level of about its mean there: an estimate that is positive holds light where there is none. So the
 fluxes and positions of stars, and their errors, depend on no iteration. For errors the amounts of
 halos are unknown too: what the images tell of them beyond the window is their prior in it.
+
+Where PSFs are not exact their errors are unknown too (`lnocl.core.solvers.psf_errors`). So is a
+cusp of the extended source under each star, a Gaussian as wide as the resolution, as bright as the
+light round the star may hide: a host that is as narrow as the PSF exchanges light with
+the star and the PSF's width.
 """
 
 from __future__ import annotations
@@ -15,12 +20,14 @@ from functools import cached_property
 import numpy as np
 import scipy.fft
 from numpy.typing import NDArray
+from scipy.linalg import block_diag
 
 from lnocl.core.scene.arrays import Array
 from lnocl.core.scene.camera import Camera, adjoint_of, seen_by
+from lnocl.core.scene.detector import on_sky
 from lnocl.core.scene.estimate import Estimate
 from lnocl.core.scene.scene import Scene
-from lnocl.core.scene.texture import Texture, hidden_radii, hidden_radius, resolution
+from lnocl.core.scene.texture import ROUND, Texture, hidden_radii, hidden_radius, resolution
 from lnocl.core.scene.transforms import enlarged
 from lnocl.core.scene.view import Places, View, Window
 from lnocl.core.solvers.fluxes import precision
@@ -31,6 +38,7 @@ from lnocl.core.solvers.least_squares import (
     LinearImage,
     SourceError,
 )
+from lnocl.core.solvers.psf_errors import VARIANCE, Made, PsfErrors
 from lnocl.core.solvers.sources import Sources
 
 # Side of the window round a star, and how far off other stars may be that are not taken as known,
@@ -38,6 +46,10 @@ from lnocl.core.solvers.sources import Sources
 WINDOW, NEIGHBOURS = 9.0, 4.0
 # What lies farther from a window has no part in the texture there, resolutions.
 MARGIN = 3.0
+# The standard deviation of the light of a cusp under a star, over the light round it.
+CUSP = 1.5
+# The standard deviation of a Gaussian of unit full width at half maximum.
+DEVIATION = VARIANCE**0.5
 # Steps of conjugate gradients at most.
 N_STEPS = 2000
 
@@ -63,11 +75,20 @@ class Surroundings:
         Radii round stars that are shown in which no image has observed a pixel, pixels of the sky.
     n_shapes : int
         Halos of each image that are unknown.
+    made : dict
+        What was made of PSFs (`lnocl.core.solvers.psf_errors`).
     """
 
-    def __init__(self, estimate: Estimate, moves: bool, raised: Array | None = None) -> None:
-        self.estimate, self.moves = estimate, moves
+    def __init__(
+        self,
+        estimate: Estimate,
+        moves: bool,
+        raised: Array | None = None,
+        holds_psfs: bool = False,
+    ) -> None:
+        self.estimate, self.moves, self.holds_psfs = estimate, moves, holds_psfs
         self.scene = scene = estimate.scene
+        self.made: Made = {}
         self.width = resolution(scene)
         self.hidden = hidden_radii(scene, self.width)
         self.cameras = [Camera(scene, j) for j in range(scene.n_images)]
@@ -118,6 +139,14 @@ class NearStar:
         unknowns, shape by shape, and then positions.
     unknowns : ndarray of int, shape (n_held, 1 or 3)
         Those of each: its flux, and perhaps x and y, which it has in all epochs.
+    n : int
+        All of these, and the cusps; those of `psfs` follow.
+    psfs : PsfErrors or None
+        The errors of the PSFs there; None where they are exact.
+    images : list of LinearImage
+        The images near the estimate, in arrays of the window.
+    prior : ndarray of float64
+        The inverse of the covariance of all unknowns before.
     resolution : float
         What all images resolve together, pixels of the sky.
     hidden : float
@@ -143,11 +172,31 @@ class NearStar:
         level = float(texture.mean[there].mean())
         self._level = LevelError(level, self._responses(around), self.window.shape)
         beyond = self.source.images_of(self.expected)
-        self._images = [
+        observation = scene.observation
+        self.psfs, self._cusps = None, list[float]()
+        error = 0.0 if around.holds_psfs else observation.psf_error
+        if error or (len(observation.psf_scatter) and not around.holds_psfs):
+            self.psfs = PsfErrors(around.estimate, self._views, around.made)
+        if error:
+            self._cusps = [self._cusp(around, s) for s in self.held]
+        self.images = [
             self._linearise(around, sources, *each)
             for each in zip(self._views, around.cameras, beyond, strict=True)
         ]
-        self._prior = self._prior_of_halos(around, sources.n)
+        self.n = sources.n + len(self._cusps)
+        prior = [self._prior_of_halos(around, sources.n), np.eye(len(self._cusps))]
+        self.prior = block_diag(*prior, *([self.psfs.prior] if self.psfs else []))
+
+    def _cusp(self, around: Surroundings, star: int) -> float:
+        """Return the standard deviation of the light of a cusp under a star."""
+        scene, window = around.scene, self.window.finer(around.scene.oversample)
+        at = on_sky(scene.stars[star], scene.oversample)[::-1]
+        rows, columns = (
+            (first + np.arange(k) - place + n / 2) % n - n / 2
+            for first, k, place, n in zip(window[:2], window.shape, at, scene.grid, strict=True)
+        )
+        is_round = np.hypot(rows[:, None], columns) - self.hidden <= ROUND * self.resolution
+        return CUSP * float(around.estimate.part(self.places(scene))[is_round].sum())
 
     def _responses(self, around: Surroundings) -> Array:
         """Return what a flat sky of ones is in the window of each image."""
@@ -178,8 +227,13 @@ class NearStar:
     @cached_property
     def fit(self) -> LeastSquares:
         """The least squares of stars, halos, and extended source and its level."""
+        return LeastSquares(self.images, self.fields, self.prior, N_STEPS, self._finished)
+
+    @cached_property
+    def fields(self) -> list[Field]:
+        """The extended source, its level, and the pixels of PSFs."""
         fields: list[Field] = [self.source, self._level]
-        return LeastSquares(self._images, fields, self._prior, N_STEPS, self._finished)
+        return fields if self.psfs is None else [*fields, self.psfs.pixels(self.window.shape)]
 
     def _prior_of_halos(self, around: Surroundings, n: int) -> Array:
         p, k = around.scene.n_images, len(self.held)
@@ -213,7 +267,17 @@ class NearStar:
 
         `beyond` is the light of the sky that is expected, less that of the estimate.
         """
-        image = sources.linear(view, view.model(around.estimate, camera))
+        model = view.model(around.estimate, camera)
+        image = sources.linear(view, model)
+        scene, cusps = around.scene, list[Array]()
+        for s, light in zip(self.held, self._cusps, strict=False):
+            width = self.resolution / scene.oversample / scene.observation.scales[view.j]
+            cusp = scene.star_cutout(view.j, s).blurred(width * DEVIATION, scene.image_grid)
+            cusps.append(light * view.cut(cusp))
+        image = image.beside(cusps, sources.n + np.arange(len(cusps)))
+        if self.psfs:
+            of_psfs, unknowns = self.psfs.slopes(view.j, model)
+            image = image.beside(of_psfs, sources.n + len(cusps) + unknowns)
         n, shape = len(image.unknowns), self.window.shape
         slopes = enlarged(image.slopes.reshape(n, *view.window.shape), shape)
         return LinearImage(

@@ -8,8 +8,9 @@ with J the derivatives of the models ``m_j``, of halos too, whose amounts are un
 their variances, A the convolutions, and ``L = a C^(1/2)`` the root of the covariance that the
 extended source is expected to have (`lnocl.core.scene.texture`), with a column for its level: what
 lies under a star nothing but this tells from it. The variance of a star is a diagonal element of
-the inverse. The extended source is eliminated by its Schur complement, with conjugate gradients, in
-a window round each star (`lnocl.core.solvers.near_star`).
+the inverse. Errors of the PSFs are unknowns too, where these are not exact
+(`lnocl.core.solvers.psf_errors`). The extended source is eliminated by its Schur complement, with
+conjugate gradients, in a window round each star (`lnocl.core.solvers.near_star`).
 
 A level of the background that is not known adds the square of what it changes in a star.
 
@@ -31,6 +32,9 @@ from lnocl.core.solvers.near_star import NearStar, Surroundings
 
 # The share of the gradient at which conjugate gradients end.
 FINISHED = 1e-8
+# Of the relative error that PSFs may have in their width: what the linear least squares leave of it
+# in a flux (docs/validation/psf_error.md).
+LEFT = 1.0 / 6.0
 
 
 def standard_errors(
@@ -71,6 +75,8 @@ def standard_errors(
         there = range(first, first + n_epochs)
         errors[first : first + n_epochs, :k] = _errors_of(near, np.isin(near.held, there), levels)
     errors[:, 0] *= scene.unit
+    left = LEFT * scene.observation.psf_error * estimate.star_fluxes[: scene.n_stars]
+    errors[:, 0] = np.hypot(errors[:, 0], left)
     return errors
 
 

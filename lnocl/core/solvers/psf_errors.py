@@ -1,0 +1,267 @@
+r"""What PSFs may have wrong, as unknowns of the least squares at a star.
+
+Every real PSF K_j is a little wrong. What the images have is taken to be
+
+.. math:: K_j + \sum_k \theta_k L_{jk} + D_j, \qquad \theta_k \sim N(0, 1),
+
+with the derivatives L of K_j (`slopes_of`), each times the standard deviation of its prior, light
+beyond its file among them (`lnocl.core.scene.psf_edge`), and the errors D_j of its pixels, in
+proportion to the PSF (`PixelErrors`). Images with the same PSF have
+the same theta. Where several images are of one epoch, each has a zero point besides: the light that
+it has of all sources, relative to the others.
+
+`lnocl.Observation` has the priors as `psf_error`, the standard deviation of the relative width.
+Light outside the stars is taken through the PSF as it is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
+from typing import Any
+
+import numpy as np
+import scipy.fft
+from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter
+
+from lnocl.core.scene.arrays import Array
+from lnocl.core.scene.cores import fwhm
+from lnocl.core.scene.estimate import Estimate
+from lnocl.core.scene.observation import Observation
+from lnocl.core.scene.psf_edge import psf_edge
+from lnocl.core.scene.psf_field import mapped
+from lnocl.core.scene.smooth_field import SmoothField
+from lnocl.core.scene.transforms import enlarged
+from lnocl.core.scene.view import View
+
+# The derivatives: by a stretch and a blur along x, across and along y each, by wings, by a shift,
+# by the light beyond the file.
+N_SLOPES, N_SHAPES = 10, 7
+# Standard deviations over that of the width: of the errors of pixels, relative to the PSF smoothed,
+# of zero points, of a shift and of the width of the Lorentzian of wings, both in widths of the PSF.
+PIXELS, ZERO_POINTS, SHIFT, WINGS = 0.67, 0.67, 0.5, 0.3
+# Errors of pixels are correlated over this, and in proportion to the PSF smoothed over that, pixels
+# of the images.
+CORRELATED, SMOOTHED = 0.6, 2.0
+# The variance of a Gaussian of unit full width at half maximum.
+VARIANCE = 1.0 / (8.0 * np.log(2.0))
+# By the PSF, the image, the shape of the window, and what is made.
+Made = dict[tuple[int, int, tuple[int, int], str], Sequence[Any]]
+# Pixels beside a PSF in which the derivatives of its edges ring.
+MARGIN = 8
+# The mean of the zero points of an epoch is known to this share of each: it is that of the fluxes.
+COMMON = 1e-3
+
+
+def slopes_of(psf: Array, error: float) -> Array:
+    r"""Return the derivatives L of a PSF, each times the standard deviation of its prior.
+
+    In spectra, with the frequencies u and v of x and y and w the width of the PSF, these are those
+    of a stretch, ``-(u, v) d/d(u, v)`` of the spectrum, of a convolution with a Gaussian,
+    ``-2 pi^2 (u^2, 2 u v, v^2)`` times it, with a Lorentzian, ``-2 pi |(u, v)|`` times it, and of a
+    shift, ``-2 pi i (u, v)`` times it. The Gaussian is such that a Gaussian PSF is as much wider as
+    by the stretch. All of them leave the light of the file as it is.
+
+    Parameters
+    ----------
+    psf : ndarray of float64, shape (ky, kx)
+        Its middle is ``(ky // 2, kx // 2)``.
+    error : float
+        Standard deviation of the relative width.
+
+    Returns
+    -------
+    ndarray of float64, shape (N_SLOPES - 1, ky, kx)
+        By a stretch along x, across and along y, by a blur likewise, by wings, and by a shift along
+        x and y.
+    """
+    width = fwhm(psf)
+    wide = np.pad(psf, MARGIN)
+    y, x = (np.arange(n) - n // 2 for n in wide.shape)
+    v, u = (2.0 * np.pi * f for f in (np.fft.fftfreq(len(y))[:, None], np.fft.rfftfreq(len(x))))
+    spectrum = scipy.fft.rfft2(wide)
+    along, across = error * scipy.fft.rfft2(np.array([x * wide, y[:, None] * wide]))
+    blur = -error * VARIANCE * width**2 * spectrum
+    shift = -1j * SHIFT * error * width * spectrum
+    spectra = [
+        *(-1j * u * along, -1j * (u * across + v * along), -1j * v * across),
+        *(u**2 * blur, 2.0 * u * v * blur, v**2 * blur),
+        -WINGS * error * width * np.hypot(u, v) * spectrum,
+        *(u * shift, v * shift),
+    ]
+    changes = scipy.fft.irfft2(np.array(spectra), wide.shape)
+    changes = changes[:, MARGIN:-MARGIN, MARGIN:-MARGIN]
+    won = changes.sum(axis=(1, 2), keepdims=True) / psf.sum()
+    return np.asarray(changes - won * psf)
+
+
+def alike(observation: Observation) -> NDArray[np.int_]:
+    """Return the number of the PSF that each image has, shape (p,)."""
+    psfs = observation.psfs
+    firsts = [next(k for k in range(j + 1) if (psfs[k] == psfs[j]).all()) for j in range(len(psfs))]
+    return np.unique(firsts, return_inverse=True)[1]
+
+
+def count(observation: Observation) -> int:
+    """Return how many PSFs the images have."""
+    return int(alike(observation).max()) + 1
+
+
+def with_errors(observation: Observation, theta: Array) -> Observation:
+    """Return an observation whose PSFs have changes of shape, shape (n_psfs, N_SHAPES).
+
+    They keep their light and their places. What the linear change would have below 0 is 0.
+    """
+    numbers, error = alike(observation), observation.psf_error
+
+    def change(j: int, stack: Array) -> Array:
+        changed = stack.copy()
+        for k, psf in enumerate(stack):
+            slopes = slopes_of(psf, error)[:N_SHAPES]
+            changed[k] += np.tensordot(theta[numbers[j]], slopes, axes=1)
+        changed = np.where(stack < 0, changed, changed.clip(0.0))
+        light = stack.sum(axis=(1, 2), keepdims=True)
+        return changed * light / changed.sum(axis=(1, 2), keepdims=True)
+
+    return observation.replace(psfs=mapped(observation.psfs_over_images, change))
+
+
+class PsfErrors:
+    """The errors of the PSFs of all images at the stars in a window.
+
+    Parameters
+    ----------
+    estimate : Estimate
+        What is modelled, and how bright it is.
+    views : sequence of p View
+        The images in the window.
+    made : dict
+        PSFs that were made of those of the scene, for other windows too.
+
+    Attributes
+    ----------
+    n : int
+        Unknowns: the theta of each PSF, N_SLOPES, and then zero points.
+    prior : ndarray of float64, shape (n, n)
+        The inverse of their covariance.
+    """
+
+    def __init__(self, estimate: Estimate, views: Sequence[View], made: Made) -> None:
+        self._estimate, self._views, self._made = estimate, views, made
+        observation = estimate.scene.observation
+        self._error, self._numbers = observation.psf_error, alike(observation)
+        n, epochs = N_SLOPES * count(observation), observation.epochs
+        self._is_one_of_several = np.bincount(epochs)[epochs] > 1
+        self._zero_points = n - 1 + np.cumsum(self._is_one_of_several)
+        self.n = n + int(self._is_one_of_several.sum())
+        self.prior = np.eye(self.n)
+        for epoch in np.unique(epochs[self._is_one_of_several]):
+            of_epoch = self._zero_points[epochs == epoch]
+            self.prior[np.ix_(of_epoch, of_epoch)] += COMMON**-2
+
+    def slopes(self, j: int, model: Array) -> tuple[list[Array], NDArray[np.int_]]:
+        """Return the derivatives of the model of an image in its window, and by which unknowns."""
+        # A PSF and one that is changed are moved alike by fractions of a pixel.
+        own, *changed = self._of_stars(j, "slopes", partial(self._changed_near, j), N_SLOPES + 1)
+        slopes = [each - own for each in changed]
+        unknowns = N_SLOPES * self._numbers[j] + np.arange(N_SLOPES)
+        if self._is_one_of_several[j]:
+            sources = model - self._views[j].background
+            slopes.append(ZERO_POINTS * self._error * sources)
+            unknowns = np.append(unknowns, self._zero_points[j])
+        return slopes, unknowns
+
+    def pixels(self, shape: tuple[int, int]) -> PixelErrors:
+        """Return the errors of pixels, in arrays of a shape, which holds all windows."""
+        scatter = self._estimate.scene.observation.psf_scatter
+        light, deviations = np.zeros((2, len(self._views), *shape))
+        for j in range(len(self._views)):
+            [own] = self._of_stars(j, "own", lambda psf: psf[None])
+            deviation = PIXELS * self._error * gaussian_filter(own, SMOOTHED)
+            if len(scatter):
+                [given] = self._of_stars(j, "scatter", partial(_instead, scatter[j]))
+                deviation = np.maximum(deviation, given)
+            light[j], deviations[j] = (enlarged(each, shape) for each in (own, deviation))
+        return PixelErrors(light, deviations, self._numbers)
+
+    def _changed_near(self, j: int, psf: Array) -> Array:
+        """Return the part of a PSF that a star in the window may light, and it with each slope.
+
+        Light beyond the file has the standard deviation that the edge of the PSF tells. It counts
+        where images are larger than the file.
+        """
+        scene, (ny, nx) = self._estimate.scene, self._views[j].window.shape
+        most = 2 * scene.oversample * ny, 2 * scene.oversample * nx
+        shape = min(psf.shape[0], most[0]), min(psf.shape[1], most[1])
+        near = enlarged(psf, shape, is_centred=True)
+        slopes = [enlarged(each, most, is_centred=True) for each in slopes_of(near, self._error)]
+        own, beyond = enlarged(psf, most, is_centred=True), np.zeros(most)
+        light, images = float(psf.sum()), scene.oversample * np.array(scene.observation.shape)
+        if light > 0 and (psf.shape < images).any():
+            edge = psf_edge(psf / light)
+            beyond = light * edge.wing(most) - edge.light * own
+        return own + np.array([np.zeros(most), *slopes, beyond])
+
+    def _of_stars(self, j: int, name: str, make: Callable[[Array], Array], n: int = 1) -> Array:
+        """Return what the stars in a window show through n arrays that are made of their PSFs."""
+        scene, view, field = self._estimate.scene, self._views[j], self._estimate.scene.star_field
+        seen = np.zeros((n, *view.window.shape))
+        for s in field.reaching(j, view.window[:2], view.window.shape):
+            if s < scene.n_stars:  # else it is a halo
+                psf = field.psfs[j][s]
+                key = id(psf), j, view.window.shape, name
+                if key not in self._made:
+                    self._made[key] = psf.changed(make)
+                for image, each in zip(seen, self._made[key], strict=True):
+                    image += self._estimate.fluxes[s] * view.cut(each.at(*field.places[j][s]))
+        return seen
+
+
+def _instead(scatter: Array, psf: Array) -> Array:
+    """Return the scatter of a PSF, as bright as that."""
+    return (psf.sum() * scatter)[None]
+
+
+class PixelErrors:
+    r"""The errors of the pixels of PSFs as a random field, in the window of a star.
+
+    .. math:: D_j = \delta - S_j \sum \delta \Big/ \sum S_j, \qquad \delta = a_j C^{1/2} x
+
+    with the light S_j of the stars there, the scatter a_j, correlated over C: no light is won or
+    lost. Images with the same PSF have the same x.
+
+    Parameters
+    ----------
+    light, scatter : ndarray of float64, shape (p, height, width)
+        S and a.
+    numbers : ndarray of int, shape (p,)
+        That of the PSF of each image.
+
+    Attributes
+    ----------
+    at : ndarray of float64, shape (n_psfs, height, width)
+        The current value of x, which is 0.
+    """
+
+    def __init__(self, light: Array, scatter: Array, numbers: NDArray[np.int_]) -> None:
+        self._scatter, self._numbers = scatter.clip(0.0), numbers
+        total = np.maximum(light.sum(axis=(1, 2), keepdims=True), np.finfo(float).tiny)
+        self._shares = light / total
+        self._smooth = SmoothField(light.shape[1:], CORRELATED)
+        self.at = np.zeros((int(numbers.max()) + 1, *light.shape[1:]))
+
+    def forward(self, x: Array) -> Iterator[Array]:
+        """Yield the changes of the images, shape (height, width)."""
+        fields = [self._smooth.apply(each) for each in x]
+        for shares, scatter, k in zip(self._shares, self._scatter, self._numbers, strict=True):
+            change = scatter * fields[k]
+            yield change - shares * change.sum()
+
+    def adjoint(self, images: Sequence[Array]) -> Array:
+        """Return the transpose of `forward` applied to images, shape (n_psfs, height, width)."""
+        back = np.zeros_like(self.at)
+        parts = zip(self._shares, self._scatter, self._numbers, images, strict=True)
+        for shares, scatter, k, image in parts:
+            back[k] += scatter * (image - np.sum(shares * image))
+        return np.array([self._smooth.apply(each) for each in back])
