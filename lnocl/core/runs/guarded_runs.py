@@ -21,6 +21,7 @@ from scipy.ndimage import gaussian_filter
 from scipy.spatial import KDTree
 
 from lnocl.core.runs.halos import hold_halos, settle_halos
+from lnocl.core.runs.psf_posterior import settle_psfs
 from lnocl.core.runs.run import Run
 from lnocl.core.runs.start import Setup, make_model, make_start
 from lnocl.core.runs.steady import STEADY
@@ -36,6 +37,7 @@ from lnocl.core.scene.psf_misfit import PsfMisfit, measure_misfit, smoothing_nea
 from lnocl.core.scene.rings import Rings
 from lnocl.core.scene.scene import Scene
 from lnocl.core.scene.transforms import enlarged
+from lnocl.core.solvers.psf_errors import with_errors
 from lnocl.core.solvers.psf_fit import settle
 from lnocl.errors import DivergedError, InputError
 from lnocl.process import ignored_notes, ignored_warnings
@@ -101,7 +103,8 @@ class GuardedRuns:
     """
 
     def __init__(self, setup: Setup, tick: Callable[[], object] = int) -> None:
-        self._tick, observation = tick, setup.observation
+        self._tick, self._whole = tick, setup.observation
+        observation = setup.observation
         self.all_stars = setup.stars
         # PSFs that are cut to the window go without what has the shape of whole ones.
         shown = with_noise_shown(observation).replace(**dict.fromkeys(BESIDE_PSFS))
@@ -163,6 +166,19 @@ class GuardedRuns:
                 if not found.misfit.is_significant or _is_settled(before.misfit, found.misfit):
                     break
         return found
+
+    def settled(self, psfs: Psfs) -> Psfs:
+        """Return PSFs as the images show them at the stars, or those given where they stay.
+
+        All are of the whole images.
+        """
+        observation = self.seen_through(psfs)
+        setup = replace(self._setup, observation=observation, stars=inside(self.stars, observation))
+        steps = settle_psfs(setup, Penalty(smoothing=self._smoothing), self._tick)
+        whole = self._whole.replace(psfs=psfs)
+        for step in steps:
+            whole = with_errors(whole, step)
+        return whole.psfs_over_images if steps else psfs
 
     def _run(self, setup: Setup, found: Judged, n_iter: int, guard: float) -> Judged:
         """Return the estimate after a run that begins at `found`, with its misfit measured anew.

@@ -23,6 +23,8 @@ from lnocl.core.runs.outcome import Mended, PsfRefinement
 from lnocl.core.runs.psf_allowance import STRENGTH, Allowance
 from lnocl.core.runs.start import Setup
 from lnocl.core.scene.arrays import Array
+from lnocl.core.scene.cores import fwhm
+from lnocl.core.scene.observation import Observation
 from lnocl.core.scene.psf_families import PsfFamilies, PsfParameters
 from lnocl.core.scene.psf_faults import name_faults
 from lnocl.core.scene.psf_field import Psfs, mapped
@@ -88,10 +90,14 @@ def mend(
 ) -> Mended:
     """Return a setup whose positions and PSFs are mended where the images ask for it.
 
-    Stars are moved first, then the noise of PSFs is taken from their wings, the families are
-    fitted, and pixels freed. Each is tried only where the misfit before is in doubt. It is taken
-    where it leaves less than half of kappa, or nothing to doubt, and every star more than half its
-    flux. Wings without noise are taken where they lower kappa.
+    PSFs that may have an error become the mean of what the stars show of it
+    (`lnocl.core.runs.psf_posterior`). Jitter need not be fitted after; nor pixels, whose scatter is
+    not known: these take a host, or a companion, for the PSF.
+
+    What does not fit then is mended: stars are moved first, then the noise of PSFs is taken from
+    their wings, the families are fitted, and pixels freed. Each is tried only where the misfit
+    before is in doubt. It is taken where it leaves less than half of kappa, or nothing to doubt,
+    and every star more than half its flux. Wings without noise are taken where they lower kappa.
 
     Free pixels fit any star, and may take some of its surroundings for the PSF. So they are to
     leave less than 0.3 of kappa, and the error that is allowed for is the one before them.
@@ -115,6 +121,13 @@ def mend(
         note(f"PSFs are not judged: {number} in the window; name `refine_psfs` to judge them")
         return Mended(setup)
     psfs = observation.psfs_over_images
+    if names and observation.psf_error:
+        psfs = runs.settled(psfs)
+    if psfs is not observation.psfs_over_images:
+        _tell_widths(observation, psfs)
+        if not is_asked:
+            needless = ("jitter",) if len(observation.psf_scatter) else ("jitter", "pixels")
+            names = [name for name in names if name not in needless]
     given = _State(psfs, runs.fit(psfs, runs.stars, moves is True), moves is True)
     state = given
     if state.misfit.is_doubtful and moves == "auto":
@@ -138,7 +151,7 @@ def mend(
         if _is_trusted(tried, loose, state.misfit.kappa):
             left, state, is_fitted = state.misfit, tried, first is fitted
             done.append("pixels fitted")
-    is_accepted = state.psfs is not psfs
+    is_accepted = state.psfs is not observation.psfs_over_images
     if is_accepted:
         observation = observation.replace(psfs=state.psfs)
     known = observation.psf_scatter
@@ -301,6 +314,17 @@ def _follow(
         if families.are_possible(after):
             return after
     return parameters
+
+
+def _tell_widths(observation: Observation, psfs: Psfs) -> None:
+    """Say in a line how wide PSFs are that were fitted to the stars, over those given."""
+    fitted = observation.replace(psfs=psfs).psfs
+    pairs = zip(fitted, observation.psfs, strict=True)
+    widths = [100.0 * (fwhm(after) / fwhm(before) - 1.0) for after, before in pairs]
+    words = f"{min(widths):+.1f}"
+    if f"{max(widths):+.1f}" != words:
+        words += f" to {max(widths):+.1f}"
+    note(f"PSFs fitted to the stars: {words} % in width (`psf_error` 0 leaves them)")
 
 
 def _tell(given: _State, state: _State, tried: _State, done: Sequence[str]) -> None:

@@ -1,0 +1,128 @@
+r"""PSFs as the images show them at their stars: the mean of what they may be.
+
+The least squares at a star (`lnocl.core.solvers.near_star`) have the errors theta of PSFs among
+their unknowns, beside the star and the extended source. Those of the brightest stars are solved
+together, with one theta. The estimate that they are of is that of a run with one weight of
+smoothing, which is made anew with the PSFs of theta, and theta then found again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
+from dataclasses import replace
+
+import numpy as np
+from scipy.linalg import block_diag
+
+from lnocl.core.runs.halos import settle_halos
+from lnocl.core.runs.start import Setup, make_start
+from lnocl.core.runs.steady import run_steadily
+from lnocl.core.scene.arrays import Array
+from lnocl.core.scene.cores import fwhm
+from lnocl.core.scene.estimate import Estimate
+from lnocl.core.scene.penalty import Penalty
+from lnocl.core.solvers.least_squares import Field, LeastSquares, LinearImage
+from lnocl.core.solvers.near_star import N_STEPS, NearStar, Surroundings
+from lnocl.core.solvers.psf_errors import N_SHAPES, N_SLOPES, alike, count, with_errors
+from lnocl.errors import DivergedError, NotFiniteError
+from lnocl.process import ignored_notes, ignored_warnings
+
+# So many of the brightest stars tell of the PSFs.
+MOST_STARS = 4
+# Rounds of a run and of a step, and the longest step, standard deviations of the prior.
+ROUNDS, MAX_STEP = 3, 6.0
+# Full width at half maximum of the narrowest PSFs that are changed, in their pixels.
+NARROWEST = 2.0
+# The share of the gradient at which conjugate gradients end.
+FINISHED = 1e-2
+# Iterations of a run, at most.
+N_ITER = 300
+
+
+def settle_psfs(setup: Setup, penalty: Penalty, tick: Callable[[], object] = int) -> list[Array]:
+    """Return steps of theta, shape (n_psfs, N_SHAPES) each, one after the other.
+
+    Shifts are left to the positions, and zero points as they are given. PSFs narrower than two of
+    their pixels are left, as their samples do not hold their shape. No step follows a run that
+    diverges.
+
+    Parameters
+    ----------
+    setup : Setup
+        The images and the parameters of the runs; one star or more among them.
+    penalty : Penalty
+        Of the runs.
+    tick : callable, optional
+        Is called after each iteration.
+    """
+    setup = replace(setup, solver="sgp", refine_positions=False)
+    theta, steps = np.zeros((count(setup.observation), N_SHAPES)), list[Array]()
+    of_psfs = dict(zip(alike(setup.observation).tolist(), setup.observation.psfs, strict=True))
+    is_sampled = np.array([fwhm(of_psfs[k]) >= NARROWEST for k in range(len(theta))])
+    if not is_sampled.any():
+        return steps
+    with suppress(DivergedError, NotFiniteError), ignored_warnings(), ignored_notes():
+        for _ in range(ROUNDS):
+            start = settle_halos(make_start(setup, penalty))
+            estimate = run_steadily(start, penalty, N_ITER, tick).estimate
+            step = np.where(is_sampled[:, None], _mean(estimate, theta) - theta, 0.0)
+            steps.append(step * MAX_STEP / max(float(abs(step).max()), MAX_STEP))
+            theta = theta + steps[-1]
+            setup = replace(
+                setup,
+                observation=with_errors(setup.observation, steps[-1]),
+                initial_extended=np.maximum(estimate.observed_sky, 0.0),
+                initial_star_fluxes=estimate.star_fluxes[: estimate.scene.n_stars],
+            )
+    return steps
+
+
+def _mean(estimate: Estimate, at: Array) -> Array:
+    """Return the mean of theta by the brightest stars, near PSFs that have it already.
+
+    Stars with PSFs of their own tell nothing.
+    """
+    scene, n_psfs = estimate.scene, len(at)
+    around, n_epochs = Surroundings(estimate, False), scene.n_epochs
+    light = np.where(scene.owned < 0, estimate.star_fluxes[: scene.n_stars], 0.0)
+    light = light.reshape(-1, n_epochs).sum(axis=1)
+    brightest = np.argsort(-light, kind="stable")[:MOST_STARS]
+    brightest = n_epochs * brightest[light[brightest] > 0]
+    if not len(brightest):
+        return at
+    nears = [NearStar(around, star, FINISHED) for star in brightest.tolist()]
+    nears = [near for near in nears if near.window.shape == nears[0].window.shape]
+    owns = np.cumsum([0, *(near.n for near in nears)])
+    images, fields, p = list[LinearImage](), list[Field](), scene.n_images
+    for k, (near, first) in enumerate(zip(nears, owns, strict=False)):
+        for image in near.images:
+            is_own = image.unknowns < near.n
+            shift = np.where(is_own, first, owns[-1] - near.n)
+            images.append(image._replace(unknowns=image.unknowns + shift))
+        fields += [_OfWindow(field, k * p, p, len(nears) * p) for field in near.fields]
+    shared = nears[0].prior[nears[0].n :, nears[0].n :]
+    prior = block_diag(*(near.prior[: near.n, : near.n] for near in nears), shared)
+    now = np.zeros(len(prior))
+    of_psfs = now[owns[-1] : owns[-1] + n_psfs * N_SLOPES].reshape(n_psfs, N_SLOPES)
+    of_psfs[:, :N_SHAPES] = at
+    change, _ = LeastSquares(images, fields, prior, N_STEPS, FINISHED).solve(now)
+    found = (now + change)[owns[-1] : owns[-1] + n_psfs * N_SLOPES]
+    return np.asarray(found.reshape(n_psfs, N_SLOPES)[:, :N_SHAPES])
+
+
+class _OfWindow:
+    """A field that is in p of many images, from one on: those of one window."""
+
+    def __init__(self, field: Field, first: int, p: int, n_images: int) -> None:
+        self._field, self._there, self._n = field, slice(first, first + p), n_images
+        self.at = field.at
+
+    def forward(self, x: Array) -> Iterable[Array]:
+        seen = np.array(list(self._field.forward(x)))
+        images = np.zeros((self._n, *seen.shape[1:]))
+        images[self._there] = seen
+        return images
+
+    def adjoint(self, images: Sequence[Array]) -> Array:
+        return self._field.adjoint(images[self._there])

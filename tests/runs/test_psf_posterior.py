@@ -1,0 +1,134 @@
+"""PSFs that are not as given: what stars show of them is used, and the rest is in the errors."""
+
+import numpy as np
+import pytest
+from scipy.ndimage import gaussian_filter
+
+import lnocl
+from lnocl.core.scene.cores import fwhm
+
+N, STAR, FLUX, LEVEL = 60, (28.3, 31.6), 3e5, 40.0
+Y, X = np.indices((N, N))
+KNOTS = gaussian_filter(np.where((X == 41) & (Y == 36), 5e4, 0.0), 1.4)
+KNOTS += gaussian_filter(np.where((X == 20) & (Y == 44), 3e4, 0.0), 2.2)
+
+
+def psf(width, n=41, shift=(0.0, 0.0), beta=3.5):
+    """Return a lopsided Moffat of a FWHM, of unit sum."""
+    y, x = np.indices((n, n)) - np.reshape(shift, (2, 1, 1))[::-1] - n // 2
+    square = width**2 / 4 / (2 ** (1 / beta) - 1)
+    values = (1 + (1.15 * x**2 + y**2 + 0.2 * x * y) / square) ** -beta
+    values *= 1 + 0.1 * np.tanh(x / width)
+    return values / values.sum()
+
+
+def at(kernel, flux):
+    """Return the star through a PSF, moved by its spectrum."""
+    n = len(kernel)
+    laid = np.zeros((3 * N, 3 * N))
+    laid[:n, :n] = kernel
+    v, u = np.fft.fftfreq(3 * N)[:, None], np.fft.rfftfreq(3 * N)
+    x, y = STAR[0] - n // 2, STAR[1] - n // 2
+    moved = np.fft.rfft2(laid) * np.exp(-2j * np.pi * (u * x + v * y))
+    return flux * np.fft.irfft2(moved, laid.shape)[:N, :N]
+
+
+def observe(widths, given, seed=0, sky=KNOTS, **known):
+    rng, images = np.random.default_rng(seed), []
+    for width, depth in zip(widths, known["exposure"], strict=True):
+        kernel = psf(width)
+        shape = (3 * N, 3 * N)
+        light = np.fft.irfft2(np.fft.rfft2(sky, shape) * np.fft.rfft2(kernel, shape), shape)
+        half = len(kernel) // 2
+        light = light[half : half + N, half : half + N] + at(kernel, FLUX)
+        images.append(rng.poisson((depth * light + LEVEL).clip(0)))
+    psfs = [psf(width) for width in given]
+    return lnocl.Observation(images, psfs, background=LEVEL, psf_centre="given", **known)
+
+
+RUN = {"engine": "numpy"}
+TRUE, DEPTHS = (3.1, 3.6), (1.0, 0.6)
+
+
+def solve(wrong, error=0.03, **options):
+    given = [width / wrong for width in TRUE]
+    observation = observe(TRUE, given, exposure=DEPTHS, psf_error=error)
+    return lnocl.deconvolve(observation, [STAR], **(RUN | options))
+
+
+@pytest.fixture(scope="module")
+def wide():
+    return solve(1.05)
+
+
+def off(found):
+    """Return by how many stated errors the star is off."""
+    return ((found.star_fluxes - FLUX) / found.star_flux_errors).item()
+
+
+def test_psfs_five_percent_too_narrow_are_fitted_and_the_star_is_within_its_error(wide):
+    widths = [fwhm(after) / fwhm(psf(w / 1.05)) for after, w in zip(wide.psfs, TRUE, strict=True)]
+    assert np.mean(widths) == pytest.approx(1.05, abs=0.015)
+    assert abs(off(wide)) < 2
+    assert 0.002 < wide.star_flux_errors / FLUX < 0.03
+    assert wide.star_fluxes == pytest.approx(FLUX, rel=0.02)
+
+
+def test_the_extended_source_gains_by_it(wide):
+    with pytest.warns(lnocl.errors.LnoclWarning, match="the PSFs do not fit"):
+        before = solve(1.05, refine_psfs=())
+    errors = [abs(gaussian_filter(each.extended - KNOTS, 1.3)).sum() for each in (wide, before)]
+    assert errors[0] < 0.6 * errors[1]
+    np.testing.assert_array_equal(before.psfs[0], psf(TRUE[0] / 1.05))
+
+
+def test_it_is_said_in_one_line(caplog):
+    caplog.set_level("INFO", "lnocl")
+    solve(1.05, n_iter=5, stop=None)
+    [line] = [each for each in caplog.messages if "PSFs fitted to the stars" in each]
+    assert "% in width (psf_error 0 leaves them)" in line
+
+
+def test_exact_psfs_stay_and_errors_hold_no_part_of_theirs(wide):
+    exact, real = solve(1.0, 0.0), solve(1.0)
+    np.testing.assert_array_equal(exact.psfs[0], psf(TRUE[0]))
+    assert abs(off(exact)) < 3
+    assert abs(off(real)) < 2
+    assert exact.star_flux_errors < real.star_flux_errors
+
+
+def test_errors_grow_with_what_psfs_may_have():
+    errors = [
+        solve(1.0, error, refine_psfs=(), n_iter=30, stop=None).star_flux_errors.item()
+        for error in (0.0, 0.01, 0.03, 0.1)
+    ]
+    assert errors == sorted(errors)
+    assert errors[3] > 3 * errors[1]
+
+
+def test_images_are_windows_of_one_observation_with_its_error():
+    observation = lnocl.Observation(np.ones((8, 8)), np.ones((3, 3)), psf_error=0.05)
+    assert observation.psf_error == 0.05
+    assert observation.window(range(4), range(4)).psf_error == 0.05
+    assert observation.replace(psf_error=0.0).psf_error == 0.0
+
+
+def test_a_host_a_little_wider_than_the_psf_is_in_the_error_of_its_star():
+    host = gaussian_filter(np.where((X == 28) & (Y == 32), 1e5, 0.0), 2.2)
+    observation = observe(TRUE, TRUE, sky=host, exposure=DEPTHS, psf_error=0.03)
+    found = lnocl.deconvolve(observation, [STAR], **RUN)
+    assert abs(off(found)) < 3
+    assert found.star_flux_errors > 0.04 * FLUX
+
+
+def test_a_file_that_ends_early_leaves_the_light_beyond_in_the_error():
+    y, x = np.indices((201, 201)) - 100
+    whole = (1 + (x**2 + y**2) / 4.0) ** -2.0
+    whole /= whole.sum()
+    image = np.random.default_rng(1).poisson(whole[64:137, 64:137] * 1e6 + 60.0)
+    cut = whole[88:113, 88:113]
+    assert cut.sum() < 0.985
+    for error, is_honest in ((0.0, False), (0.03, True)):
+        observation = lnocl.Observation(image, cut, background=60.0, psf_error=error)
+        found = lnocl.deconvolve(observation, [(36, 36)], **RUN)
+        assert (abs(found.star_fluxes - 1e6) < 3 * found.star_flux_errors).item() == is_honest
