@@ -11,6 +11,7 @@ from lnocl.core.scene.arrays import Array
 from lnocl.core.scene.cores import fwhm
 from lnocl.core.scene.detector import seen_psfs
 from lnocl.core.scene.observation import Observation
+from lnocl.core.scene.psf_edge import psf_edge
 from lnocl.core.scene.shifting import ENDLESS, MovablePsf
 from lnocl.core.scene.transforms import enlarged
 
@@ -21,8 +22,9 @@ MOST_STARS = 5
 # A PSF has a fault where reduced chi squared is above this, and turned leaves this share of the
 # excess, and less than all others by as much.
 WRONG, LEFT = 2.0, 0.3
-# A border has a pedestal of this share of the PSF's light or more, and its quartiles are as near.
-PEDESTAL, LEVEL = 0.02, 0.2
+# A pedestal has this share of the PSF's light or more, and so many standard errors: wings and halos
+# may be flat too.
+PEDESTAL, CLEAR = 0.02, 4.0
 
 TURNS: dict[str, Callable[[Array], Array]] = {
     "flipped along x": lambda psf: psf[:, ::-1],
@@ -70,9 +72,10 @@ def name_faults(observation: Observation, stars: Array) -> str:
         stamps = _stamps(observation, j, stars, psf)
         if name := _turn(psf, stamps) if stamps else "":
             return f"`psfs[{j}]` fits when it is {name}: give it so"
-        if (share := _pedestal(observation.psfs[j])) > PEDESTAL:
+        edge = psf_edge(observation.psfs[j])
+        if edge.level > max(PEDESTAL, CLEAR * edge.level_error):
             return (
-                f"`psfs[{j}]` has a pedestal of {100 * share:.2g} % of its light, level all round "
+                f"`psfs[{j}]` has a pedestal of {100 * edge.level:.2g} % of its light, level to "
                 "its border: take that off"
             )
     return ""
@@ -110,10 +113,3 @@ def _turn(psf: Array, stamps: list[_Stamp]) -> str:
     left = {name: excess(np.ascontiguousarray(turn(square))) for name, turn in TURNS.items()}
     (best, least), (_, second) = sorted(left.items(), key=lambda each: each[1])[:2]
     return best if least < LEFT * min(given, second) else ""
-
-
-def _pedestal(psf: Array) -> float:
-    """Return the share of its light that the level of a PSF's border has; 0 if that is no level."""
-    border = np.concatenate([psf[0], psf[-1], psf[1:-1, 0], psf[1:-1, -1]])
-    low, middle, high = np.quantile(border, [0.25, 0.5, 0.75])
-    return float(middle) * psf.size if 0 < high - low < LEVEL * middle or low == high > 0 else 0.0
