@@ -79,8 +79,8 @@ def write_simulation(
         *("--background", *(repr(b) for b in dict.fromkeys(simulation.background.tolist()))),
         *("--read-noise", repr(simulation.read_noise)),
         *(word for x, y in simulation.stars for word in ("--star", f"{x},{y}")),
-        # What leaves one edge of a simulation comes in at the opposite one.
-        *("--pad", "0", "-o", path_in(inside, "result")),
+        # PSFs are exact; what leaves one edge of a simulation comes in at the opposite one.
+        *("--psf-error", "0", "--pad", "0", "-o", path_in(inside, "result")),
     ]
 
 
