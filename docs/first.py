@@ -7,7 +7,11 @@ from lnocl.simulation import Experiment, hh34, simulate
 
 seen = simulate(hh34(128), Experiment(exposure_time="1 min"))
 observation = lnocl.Observation(
-    seen.images, seen.psfs, background=seen.background, read_noise=seen.read_noise
+    seen.images,
+    seen.psfs,
+    psf_error=0,
+    background=seen.background,
+    read_noise=seen.read_noise,
 )
 result = lnocl.deconvolve(observation, stars=seen.stars, pad=0)
 result.plot().savefig(sys.argv[1], dpi=80)

@@ -23,7 +23,11 @@ from lnocl.simulation import Experiment, hh34, simulate
 
 seen = simulate(hh34(128), Experiment(exposure_time="10 s"))
 observation = lnocl.Observation(
-    seen.images, seen.psfs, background=seen.background, read_noise=seen.read_noise
+    seen.images,
+    seen.psfs,
+    psf_error=0,
+    background=seen.background,
+    read_noise=seen.read_noise,
 )
 options = {"smoothing": 0, "pad": 0}
 errors, images = [], {}

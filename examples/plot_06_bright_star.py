@@ -25,7 +25,11 @@ target = Target(hh34(128).extended, [Star(64, 32, 9 * u.mag)])
 seen = simulate(target, Experiment(exposure_time="1 min"))
 print(f"star over jet: {seen.star_fluxes[0] / seen.extended.sum():.0f}")
 observation = lnocl.Observation(
-    seen.images, seen.psfs, background=seen.background, read_noise=seen.read_noise
+    seen.images,
+    seen.psfs,
+    psf_error=0,
+    background=seen.background,
+    read_noise=seen.read_noise,
 )
 
 

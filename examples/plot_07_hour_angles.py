@@ -35,6 +35,7 @@ for angles in ([0], [0, 90], [0, 45, 90, 135]):
     observation = lnocl.Observation(
         seen.images,
         seen.psfs,
+        psf_error=0,
         background=seen.background,
         read_noise=seen.read_noise,
         exposure=minutes,

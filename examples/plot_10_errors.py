@@ -24,7 +24,11 @@ from lnocl.simulation import Experiment, hh34, simulate
 
 seen = simulate(hh34(128), Experiment(exposure_time="1 min"))
 observation = lnocl.Observation(
-    seen.images, seen.psfs, background=seen.background, read_noise=seen.read_noise
+    seen.images,
+    seen.psfs,
+    psf_error=0,
+    background=seen.background,
+    read_noise=seen.read_noise,
 )
 result = lnocl.deconvolve(observation, seen.stars, n_iter=60, stop=None, pad=0)
 

@@ -25,7 +25,11 @@ host = np.exp(-radius / 10) + 0.5 * np.exp(-(((radius - 28) / 4) ** 2) / 2)
 target = Target(host, [Star(64, 64, 10.5 * u.mag)])
 seen = simulate(target, Experiment(exposure_time="2 min"))
 observation = lnocl.Observation(
-    seen.images, seen.psfs, background=seen.background, read_noise=seen.read_noise
+    seen.images,
+    seen.psfs,
+    psf_error=0,
+    background=seen.background,
+    read_noise=seen.read_noise,
 )
 quasar = seen.stars[0]
 
