@@ -314,11 +314,12 @@ def deconvolve(
     Images that are turned, of several epochs or with halos are judged alike, each PSF in the frame
     of its image. Of PSFs that vary over an image all are changed alike.
 
-    **Star fluxes are marginal** where PSFs were judged and fit, or are not exact. What lies under a
-    star belongs to it or to the extended source, and early iterations leave it to the star. So
-    after the last iteration each star takes a step of Newton to the flux that the counts give it
-    with the extended source marginalised (`lnocl.core.solvers.marginal`). The extended source takes
-    up what stars lose. A callback and the history have the iterations as they were.
+    **Star fluxes are marginal** where PSFs were judged and fit, or have no larger error than
+    `psf_error`. What lies under a star belongs to it or to the extended source, and early
+    iterations leave it to the star. So after the last iteration each star takes a step of Newton to
+    the flux that the counts give it with the extended source marginalised
+    (`lnocl.core.solvers.marginal`). The extended source takes up what stars lose. A callback and
+    the history have the iterations as they were.
 
     **Levels** of backgrounds with a `background_error` are fitted after a short run, and again at
     the end, with a gradient (`lnocl.core.solvers.levels`). Their errors are in those of star fluxes
@@ -399,7 +400,10 @@ def deconvolve(
 
 def _finish(outcome: Outcome, plan: Plan, prepared: Prepared, progress: bool) -> Outcome:
     """Return an outcome with what the plan has marginal, and how well PSFs fit."""
-    is_fit = prepared.fits or (plan.does(STARS) and prepared.setup.observation.psf_error > 0)
+    is_fit = prepared.fits
+    if plan.does(STARS) and plan.does(PSFS) and prepared.refinement is not None:
+        # No more is wrong than PSFs may have.
+        is_fit |= prepared.refinement.psf_error <= prepared.setup.observation.psf_error
     if plan.does(STARS) and not plan.does(PSFS):  # as all stars have PSFs of their own
         is_fit = not any(star.is_misfit for star in outcome.star_residuals())
     if prepared.stop == "held-out" and outcome.stop_reason not in ("held-out", "callback"):

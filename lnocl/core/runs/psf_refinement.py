@@ -91,8 +91,9 @@ def mend(
     """Return a setup whose positions and PSFs are mended where the images ask for it.
 
     PSFs that may have an error become the mean of what the stars show of it
-    (`lnocl.core.runs.psf_posterior`). Jitter need not be fitted after; nor pixels, whose scatter is
-    not known: these take a host, or a companion, for the PSF.
+    (`lnocl.core.runs.psf_posterior`), unless they fit worse so. Jitter need not be fitted after;
+    nor pixels, whose scatter is not known, where little is wrong: these take a host, or a
+    companion, for the PSF.
 
     What does not fit then is mended: stars are moved first, then the noise of PSFs is taken from
     their wings, the families are fitted, and pixels freed. Each is tried only where the misfit
@@ -121,14 +122,16 @@ def mend(
         note(f"PSFs are not judged: {number} in the window; name `refine_psfs` to judge them")
         return Mended(setup)
     psfs = observation.psfs_over_images
+    given = _State(psfs, runs.fit(psfs, runs.stars, moves is True), moves is True)
     if names and observation.psf_error:
-        psfs = runs.settled(psfs)
-    if psfs is not observation.psfs_over_images:
+        given = _settle(runs, given)
+    if given.psfs is not psfs:
+        psfs = given.psfs
         _tell_widths(observation, psfs)
         if not is_asked:
-            needless = ("jitter",) if len(observation.psf_scatter) else ("jitter", "pixels")
+            is_wrong = given.misfit.kappa > FREED or len(observation.psf_scatter)
+            needless = ("jitter",) if is_wrong else ("jitter", "pixels")
             names = [name for name in names if name not in needless]
-    given = _State(psfs, runs.fit(psfs, runs.stars, moves is True), moves is True)
     state = given
     if state.misfit.is_doubtful and moves == "auto":
         state = _move(runs, state)
@@ -191,6 +194,16 @@ def _of_stars(state: _State) -> Array:
 def _shows_pixels(misfit: PsfMisfit) -> bool:
     """Return whether a misfit is enough for free pixels, which else follow the noise."""
     return misfit.is_significant or misfit.kappa > FREED
+
+
+def _settle(runs: GuardedRuns, state: _State) -> _State:
+    """Return the state with PSFs that are the mean of what they may be, unless they fit worse."""
+    psfs = runs.settled(state.psfs)
+    if psfs is state.psfs:
+        return state
+    settled = _State(psfs, runs.fit(psfs, runs.stars, state.moves), state.moves)
+    is_worse = settled.misfit.significance > state.misfit.significance + GONE
+    return state if is_worse else settled
 
 
 def _move(runs: GuardedRuns, state: _State) -> _State:
