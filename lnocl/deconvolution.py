@@ -171,9 +171,10 @@ def deconvolve(
         What is fitted of PSFs to the stars before the reconstruction, where they do not fit: shift,
         jitter (a blur, or a sharpening), strehl (needs `ideal_psfs` or `pupils`), pupil (phases;
         needs `pupils`), modes (needs `psf_modes`), pixels. They are used where they fit better. By
-        default, where `smoothing` is "auto", these are of several images shift, and those that need
-        what is given, with pixels where their scatter is. Where the `psf_error` of the observation
-        is 0, jitter and pixels too. Where it is more, PSFs become what the stars show of them.
+        default, where `smoothing` is "auto", these are jitter, of several images shift, those that
+        need what is given, and pixels. Where the `psf_error` of the observation is not 0, PSFs
+        first become what the stars show of them; pixels are then fitted only where more than a
+        tenth is wrong, or their scatter is given.
 
         The extended source is marginalised. An empty sequence is for none, and leaves PSFs as they
         are given. See Notes. At least one
@@ -287,8 +288,8 @@ def deconvolve(
     cusp of the extended source under each star are unknowns beside the stars, with priors
     (`lnocl.core.solvers.psf_errors`). Their mean by the brightest stars, after a run with a fixed
     weight, makes the PSFs of the reconstruction, three times in turn
-    (`lnocl.core.runs.psf_posterior`). All of them are marginalised in fluxes, places and their
-    errors (:doc:`/validation/psf_error`).
+    (`lnocl.core.runs.psf_posterior`). All of them are marginalised in the errors of fluxes and
+    places (:doc:`/validation/psf_error`).
 
     **PSFs that do not fit** leave light beside a star, and an extended source that is free there
     takes it up. So PSFs are judged by short runs in a window round the stars. In these the
@@ -314,12 +315,11 @@ def deconvolve(
     Images that are turned, of several epochs or with halos are judged alike, each PSF in the frame
     of its image. Of PSFs that vary over an image all are changed alike.
 
-    **Star fluxes are marginal** where PSFs were judged and fit, or have no larger error than
-    `psf_error`. What lies under a star belongs to it or to the extended source, and early
-    iterations leave it to the star. So after the last iteration each star takes a step of Newton to
-    the flux that the counts give it with the extended source marginalised
-    (`lnocl.core.solvers.marginal`). The extended source takes up what stars lose. A callback and
-    the history have the iterations as they were.
+    **Star fluxes are marginal** where PSFs were judged and fit. What lies under a star belongs to
+    it or to the extended source, and early iterations leave it to the star. So after the last
+    iteration each star takes a step of Newton to the flux that the counts give it with the extended
+    source marginalised (`lnocl.core.solvers.marginal`). The extended source takes up what stars
+    lose. A callback and the history have the iterations as they were.
 
     **Levels** of backgrounds with a `background_error` are fitted after a short run, and again at
     the end, with a gradient (`lnocl.core.solvers.levels`). Their errors are in those of star fluxes
@@ -401,9 +401,6 @@ def deconvolve(
 def _finish(outcome: Outcome, plan: Plan, prepared: Prepared, progress: bool) -> Outcome:
     """Return an outcome with what the plan has marginal, and how well PSFs fit."""
     is_fit = prepared.fits
-    if plan.does(STARS) and plan.does(PSFS) and prepared.refinement is not None:
-        # No more is wrong than PSFs may have.
-        is_fit |= prepared.refinement.psf_error <= prepared.setup.observation.psf_error
     if plan.does(STARS) and not plan.does(PSFS):  # as all stars have PSFs of their own
         is_fit = not any(star.is_misfit for star in outcome.star_residuals())
     if prepared.stop == "held-out" and outcome.stop_reason not in ("held-out", "callback"):

@@ -188,8 +188,8 @@ class TestSimulate:
         background = repr(float(expected.background[0]))
         assert told == (
             "lnocl deconvolve out/image_1.fits out/image_2.fits --psf out/psf_1.fits "
-            f"out/psf_2.fits --background {background} --read-noise 10.0 --star 20,30 --psf-error 0 "
-            "--pad 0 -o out/result.fits"
+            f"out/psf_2.fits --background {background} --read-noise 10.0 --star 20,30 "
+            "--psf-error 0 --pad 0 -o out/result.fits"
         )
         assert cli.main([*shlex.split(told)[1:], "--n-iter", "2", "--engine", "numpy"]) == 0
         assert fits.getdata("out/result.fits").shape == (64, 64)

@@ -91,9 +91,8 @@ def mend(
     """Return a setup whose positions and PSFs are mended where the images ask for it.
 
     PSFs that may have an error become the mean of what the stars show of it
-    (`lnocl.core.runs.psf_posterior`), unless they fit worse so. Jitter need not be fitted after;
-    nor pixels, whose scatter is not known, where little is wrong: these take a host, or a
-    companion, for the PSF.
+    (`lnocl.core.runs.psf_posterior`), unless they fit worse so. Pixels, whose scatter is not known,
+    are not freed then where little is wrong: they take a host, or a companion, for the PSF.
 
     What does not fit then is mended: stars are moved first, then the noise of PSFs is taken from
     their wings, the families are fitted, and pixels freed. Each is tried only where the misfit
@@ -128,10 +127,9 @@ def mend(
     if given.psfs is not psfs:
         psfs = given.psfs
         _tell_widths(observation, psfs)
-        if not is_asked:
-            is_wrong = given.misfit.kappa > FREED or len(observation.psf_scatter)
-            needless = ("jitter",) if is_wrong else ("jitter", "pixels")
-            names = [name for name in names if name not in needless]
+        is_wrong = given.misfit.kappa > FREED or len(observation.psf_scatter)
+        if not (is_asked or is_wrong):
+            names = [name for name in names if name != "pixels"]
     state = given
     if state.misfit.is_doubtful and moves == "auto":
         state = _move(runs, state)
