@@ -49,7 +49,7 @@ def test_a_star_whose_core_is_clipped_has_its_flux_within_its_error(caplog):
 @pytest.mark.parametrize("option", [{"mend_images": False}, {"smoothing": 0.1}])
 def test_nothing_is_mended_where_that_is_not_wanted(option):
     given = clipped()
-    prepared = prepare(lnocl.plan(given, [STAR], refine_psfs=(), **option))
+    prepared = prepare(lnocl.plan(given, [STAR], engine="numpy", refine_psfs=(), **option))
     assert not prepared.setup.observation.mask.any()
     assert not prepared.found
 
