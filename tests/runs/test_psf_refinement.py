@@ -380,12 +380,28 @@ class TestAScatterThatIsGiven:
         assert near[0, 63] < 0.02 * of_star
         np.testing.assert_allclose(found.may_be_faked, 0.05 * light, rtol=0.03, atol=1e-6)
 
-    def test_it_needs_a_star(self):
+    def test_without_a_star_nothing_is_judged_by_it(self):
         observation = lnocl.Observation(images_through([PSF]), PSF, psf_scatter=PSF)
-        with pytest.raises(
-            lnocl.InputError, match="psf_scatter is the error of PSFs at stars; give stars"
-        ):
-            lnocl.deconvolve(observation)
+        assert not lnocl.plan(observation).judges_psfs
+
+    def test_psfs_that_may_have_an_error_are_as_right_as_without_it(self):
+        """It is among the unknowns at the star: the run is the same, and its error is larger."""
+        images, scatter = images_through([PSF], 30.0), 0.05 * PSF.max() * np.ones_like(PSF)
+        known = {"background": LEVEL, "psf_error": 0.01}
+        results = [
+            lnocl.deconvolve(
+                lnocl.Observation(images, PSF, **known, **more),
+                [STAR], engine="numpy", n_iter=4, stop=None,
+            )
+            for more in ({}, {"psf_scatter": scatter})
+        ]  # fmt: skip
+        without, beside = results
+        assert beside.psf_refinement is without.psf_refinement is None
+        np.testing.assert_allclose(beside.extended, without.extended, rtol=1e-6, atol=1e-6)
+        assert beside.star_flux_errors[0] > 1.2 * without.star_flux_errors[0]
+        weighted = lnocl.plan(beside._observation, [STAR], smoothing=0.1)
+        assert not weighted.judges_psfs
+        np.testing.assert_array_equal(beside._observation.psf_scatter, [scatter])
 
 
 @pytest.mark.parametrize("exposure", [1.0, 40.0])

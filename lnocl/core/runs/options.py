@@ -110,10 +110,6 @@ def check_families(
         pupils or modes are lacking; pupils differ in their apertures; a shift of one image is asked
         for beside free positions.
     """
-    if len(observation.psf_scatter) and not len(positions):
-        raise InputError(
-            "`psf_scatter` is the error of PSFs at stars; give stars, or leave `psf_scatter` out"
-        )
     if isinstance(names, str) and names == "auto":
         names = automatic_families(observation) if is_auto else ()
     if isinstance(names, str) or not isinstance(names, Iterable):

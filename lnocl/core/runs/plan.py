@@ -160,8 +160,10 @@ class Plan:
     @property
     def judges_psfs(self) -> bool:
         """Whether PSFs are judged before the run, of itself or as it was asked for."""
-        is_given = len(self.setup.observation.psf_scatter) > 0
-        return self.does(PSFS) or bool(self.families) or is_given
+        observation = self.setup.observation
+        # Else it is one of the unknowns at the stars.
+        is_given = len(observation.psf_scatter) > 0 and not observation.psf_error
+        return self.does(PSFS) or bool(self.families) or (is_given and SHOWS_PSFS.holds(self))
 
     def why_not(self, step: str) -> str:
         """Return why a step of `STEPS` is not done; nothing where it is."""

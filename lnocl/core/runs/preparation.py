@@ -111,13 +111,26 @@ def _mend_images(plan: Plan) -> tuple[Setup, dict[str, str]]:
 
 
 def _judge_psfs(plan: Plan, setup: Setup, progress: bool) -> Mended:
-    """Return that of `lnocl.core.runs.psf_refinement.mend`, or `setup` where it is not finite."""
+    """Return that of `lnocl.core.runs.psf_refinement.mend`, or `setup` where it is not finite.
+
+    Where PSFs may have an error, their scatter is one of the unknowns at the stars: PSFs fit unless
+    residuals show otherwise. Exact ones are wrong by the scatter that is given.
+    """
     from lnocl.core.runs.psf_refinement import mend  # which loads scipy
 
+    known, judged = setup.observation.psf_scatter, setup
+    if setup.observation.psf_error and len(known):
+        judged = replace(setup, observation=setup.observation.replace(psf_scatter=None))
+    mended = Mended(judged)
     judging = Progress(None, "it", bool(progress), "judging the PSFs", stays=False)
     with judging, suppress(NotFiniteError):  # of which the run itself tells
-        return mend(setup, plan.families, plan.moves, plan.is_asked, judging.update)
-    return Mended(setup)
+        mended = mend(judged, plan.families, plan.moves, plan.is_asked, judging.update)
+    if judged is setup:
+        return mended
+    observation = mended.setup.observation
+    found = observation.psf_scatter
+    observation = observation.replace(psf_scatter=np.maximum(known, found) if len(found) else known)
+    return mended._replace(setup=replace(mended.setup, observation=observation))
 
 
 def _penalties(plan: Plan, mended: Mended, are_psfs_wrong: bool) -> list[Penalty]:
