@@ -17,6 +17,7 @@ from lnocl.detection.maxima import SIGNIFICANT
 from lnocl.errors import InputError, counted
 from lnocl.psf.centring import Point, brightest
 from lnocl.psf.repair import repair
+from lnocl.psf.scatter import of_one, of_several
 from lnocl.psf.steps import cut_square, measure_background, nearest_pixel
 
 # Rounds of fitting the stars and adding what is left of them to the PSF.
@@ -60,7 +61,7 @@ class EffectivePsf(NamedTuple):
     psf : ndarray of float64, shape (k, k)
         Of unit sum and odd side.
     scatter : ndarray of float64, shape (k, k)
-        Standard deviation of the stars' own PSFs from it, noise included, weighted by their flux.
+        Standard deviation of what a star shows from it (`lnocl.psf.scatter`).
     stars : list of FittedStar
         The stars.
     n_neighbours : int
@@ -144,11 +145,11 @@ def join(frames: Sequence[Array], bad: Sequence[Mask]) -> tuple[Array, list[Poin
 
 
 def lines(found: EffectivePsf) -> tuple[str, ...]:
-    """Return how well the PSF fits each star, and by how much they differ, as lines of a record."""
+    """Return how well the PSF fits each star, and what errors it has, as lines of a record."""
     psf, side = found.psf, len(found.psf)
     n = len(found.stars)
     core = psf > CORE * psf.max()
-    differ = float(np.sqrt(np.mean(found.scatter[core] ** 2)) / psf.max())
+    error = float(np.sqrt(np.mean(found.scatter[core] ** 2)) / psf.max())
     return (
         *(
             f"star {s} of {n}: x = {star.x:.3f}, y = {star.y:.3f}, flux {star.flux:.6g}; "
@@ -156,8 +157,8 @@ def lines(found: EffectivePsf) -> tuple[str, ...]:
             for s, star in enumerate(found.stars, 1)
         ),
         f"effective PSF: {counted(n, 'star')}, {found.n_neighbours} pixels of neighbours left out "
-        f"within {side} x {side} pixels; stars differ from it by {100 * differ:.2f} % of the peak "
-        "in the core (rms, noise included)",
+        f"within {side} x {side} pixels; its pixels have errors of {100 * error:.2f} % of the peak "
+        "in the core (rms, by noise and how stars differ)",
     )
 
 
@@ -167,7 +168,7 @@ class _Stars:
     def __init__(
         self, light: Array, bad: Mask, centres: list[Point], half: int, n_given: int
     ) -> None:
-        self._half, self._n_given = half, n_given
+        self._half, self._n_given, self._frame, self._bad = half, n_given, light, bad
         self._repaired = np.pad(light, half)
         self._good = np.pad(~bad, half)
         self._light = np.where(self._good, self._repaired, 0.0)
@@ -210,15 +211,16 @@ class _Stars:
         repair(psf, hidden, hidden)
         covered = (weight == 0) & ~hidden  # by others: what lies opposite is the best guess
         psf[covered] = np.where(covered, 0.0, psf)[::-1, ::-1][covered]
-        return self._finished(psf, used, weight)
+        return self._finished(psf, used)
 
-    def _finished(self, psf: Array, shown: Array, weight: Array) -> EffectivePsf:
+    def _finished(self, psf: Array, shown: Array) -> EffectivePsf:
         left, _ = self._residual(psf)
-        n = (shown > 0).sum(axis=0)
         apart = np.array([self._centred(left, s) / c for s, c in enumerate(self._fluxes)])
-        squares = np.einsum("s,syx->yx", self._fluxes, (apart * shown) ** 2)
-        few = np.where(n > 1, weight * (n - 1) / np.maximum(n, 1), np.inf)
-        scatter = np.sqrt(squares / few)
+        if len(self._fluxes) > 1:
+            scatter = of_several(apart, shown, self._fluxes, psf, self._frame, self._bad)
+        else:
+            (pixel,), (flux,) = self._pixels, self._fluxes
+            scatter = of_one(self._repaired, ~self._good, pixel, self._half) / flux
         total = psf.sum()
         core = psf > CORE * psf.max()
         stars = []

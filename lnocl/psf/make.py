@@ -19,6 +19,7 @@ from lnocl.detection.checks import read_image
 from lnocl.errors import InputError
 from lnocl.psf import checks, effective, resampling, steps
 from lnocl.psf.centring import Pixel, Point
+from lnocl.psf.scatter import of_one
 
 
 @dataclass(frozen=True)
@@ -29,9 +30,9 @@ class StarPsf:
     ----------
     psf : ndarray of float64, shape (k, k)
         Point spread function of unit sum, the star's centre at ``(k // 2, k // 2)``.
-    scatter : ndarray of float64, shape (k, k), or None
-        Standard deviation of the stars' own PSFs from it, weighted by flux, noise included. None
-        where one star was given.
+    scatter : ndarray of float64, shape (k, k)
+        Standard deviation of its pixels: noise, and how stars differ where there are several
+        (`lnocl.psf.scatter`). `lnocl.Observation` takes it with the PSF.
     shared_steps : tuple of str
         One line for each step that PSFs at all angles share, in order, with its numbers.
     own_steps : tuple of str
@@ -60,12 +61,12 @@ class StarPsf:
     >>> y, x = np.mgrid[:40, :50]
     >>> frame = 100 + 5000 * np.exp(-((x - 23.3) ** 2 + (y - 18.8) ** 2) / 8)
     >>> star = make_psf(frame, size=21, background=100.0)
-    >>> star.psf.shape, round(star.flux), star.background, star.scatter
-    ((21, 21), 125664, 100.0, None)
+    >>> star.psf.shape, round(star.flux), star.background, star.scatter.shape
+    ((21, 21), 125664, 100.0, (21, 21))
     """
 
     psf: Array
-    scatter: Array | None
+    scatter: Array
     shared_steps: tuple[str, ...]
     own_steps: tuple[str, ...]
     flux: float
@@ -368,7 +369,6 @@ def make_psfs(
     if len(middles) == 1:
         (pixel,) = middles
         steps.refuse_hole(unrepairable, pixel)
-    scatter: Array | None = None
     combined: tuple[str, ...] = ()
     far = max(resampling.reach(side, angle) for angle in angles) + MARGIN
     lowered, others = list[str](), list[str]()
@@ -387,8 +387,10 @@ def make_psfs(
         centres = [(star.y, star.x) for star in stars.stars[: len(middles)]]
         flux = sum(star.flux for star in stars.stars)
         light, pixel, shift = flux * stars.psf, (far, far), None
-        scatter = flux * stars.scatter if len(middles) > 1 else None
+        scatter = flux * stars.scatter
         combined = (*others, *effective.lines(stars))
+    else:
+        scatter = of_one(light, unusable, pixel, far)
     squares = [
         _make_square(light, pixel, shift, side, angle, level, clip_negative) for angle in angles
     ]
@@ -396,7 +398,7 @@ def make_psfs(
     return [
         StarPsf(
             square.psf / square.flux,
-            None if scatter is None else _turn_scatter(scatter, side, angle) / square.flux,
+            _turn_scatter(scatter, side, angle) / square.flux,
             (*found, measured, *lowered, repaired, *centred, *combined),
             square.lines,
             square.flux,

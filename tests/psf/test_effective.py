@@ -120,18 +120,6 @@ def test_bad_and_saturated_pixels_are_left_to_other_stars():
     assert error(alone, 2.5) > 0.02
 
 
-def test_stars_that_differ_show_it_in_the_scatter():
-    places = np.round(PLACES)
-    frame = a_frame(3.0, places[:3], [1.0] * 3) + a_frame(4.0, places[3:], [1.0])
-    star = make_psf(frame, places, SIZE, background=0.0)
-    core = star.psf > 0.1 * star.psf.max()
-    parts = [truth(3.0)] * 3 + [truth(4.0)]
-    fluxes = [(part * star.psf)[core].sum() / (star.psf**2)[core].sum() for part in parts]
-    squares = [(part / c - star.psf) ** 2 for part, c in zip(parts, fluxes, strict=True)]
-    expected = np.sqrt(np.average(squares, axis=0, weights=fluxes) * 4 / 3)
-    np.testing.assert_allclose(star.scatter[core], expected[core], rtol=1e-3)
-
-
 def test_all_angles_are_of_the_same_stars():
     frame = a_frame(3.0)
     straight, turned = make_psfs(frame, [0, 90], PLACES, SIZE, background=0.0)
