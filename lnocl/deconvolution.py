@@ -174,7 +174,7 @@ def deconvolve(
         default, where `smoothing` is "auto", these are jitter, of several images shift, those that
         need what is given, and pixels. Where the `psf_error` of the observation is not 0, PSFs
         first become what the stars show of them; pixels are then fitted only where more than a
-        tenth is wrong, or their scatter is given.
+        tenth is wrong.
 
         The extended source is marginalised. An empty sequence is for none, and leaves PSFs as they
         are given. See Notes. At least one
@@ -281,14 +281,14 @@ def deconvolve(
     - "strehl", the Strehl ratio between the PSF and ``ideal_psfs``;
     - "pupil", phases across ``pupils``;
     - "modes", the coefficients of ``psf_modes``;
-    - "pixels", each pixel, as far as ``psf_scatter`` or the residuals allow.
+    - "pixels", each pixel, as far as the residuals allow, or the ``psf_scatter`` of exact PSFs.
 
     **PSFs are never exact**, unless the `psf_error` of the observation is 0. Stretch, blur and
-    wings of each, the errors of its pixels, the light beyond its file, zero points of images and a
-    cusp of the extended source under each star are unknowns beside the stars, with priors
-    (`lnocl.core.solvers.psf_errors`). Their mean by the brightest stars, after a run with a fixed
-    weight, makes the PSFs of the reconstruction, three times in turn
-    (`lnocl.core.runs.psf_posterior`). All of them are marginalised in the errors of fluxes and
+    wings of each, the errors of its pixels (``psf_scatter`` where that is more), the light beyond
+    its file, zero points of images and a cusp of the extended source under each star are unknowns
+    beside the stars, with priors (`lnocl.core.solvers.psf_errors`). Their mean by the brightest
+    stars, after a run with a fixed weight, makes the PSFs of the reconstruction, three times in
+    turn (`lnocl.core.runs.psf_posterior`). All of them are marginalised in the errors of fluxes and
     places (:doc:`/validation/psf_error`).
 
     **PSFs that do not fit** leave light beside a star, and an extended source that is free there
@@ -304,13 +304,14 @@ def deconvolve(
 
     What is left, a relative error κ of the PSFs, adds to λ twice the standard deviation of the data
     term's gradient by it, ``2 sqrt(sum_j (A_j^2)^T (κ S_j / m_j)^2)``, with S_j the starlight. So
-    does a ``psf_scatter`` that is given, and the error that free pixels have mended. It is the
-    error in each ring round the stars, where it is two standard deviations or more. The run then
-    ends where the objective hardly changes any more (:doc:`/validation/psf`). Where single rings
-    show an error and all of them together show none, held-out counts choose λ. Where `smoothing` is
-    a number, it stays as it is, scatter or not, and PSFs are judged only where `refine_psfs` names
-    families or a scatter is given. Those of more than 64 stars in the window are judged only where
-    families are named. Stars whose positions are not refined are taken to be where they are given.
+    does the ``psf_scatter`` of PSFs whose `psf_error` is 0, and the error that free pixels have
+    mended. It is the error in each ring round the stars, where it is two standard deviations or
+    more. The run then ends where the objective hardly changes any more (:doc:`/validation/psf`).
+    Where single rings show an error and all of them together show none, held-out counts choose λ.
+    Where `smoothing` is a number, it stays as it is, scatter or not, and PSFs are judged only where
+    `refine_psfs` names families, or exact ones have a scatter. Those of more than 64 stars in the
+    window are judged only where families are named. Stars whose positions are not refined are taken
+    to be where they are given.
 
     Images that are turned, of several epochs or with halos are judged alike, each PSF in the frame
     of its image. Of PSFs that vary over an image all are changed alike.

@@ -49,8 +49,7 @@ OPTIONS = [
         dest="position",
         help="position of the star to a few pixels, 0-based, x along columns, or on the sky, as "
         "in 65d,19.5d (default: the brightest pixel that is not a single hot one); several give "
-        "the PSF that they share, "
-        "and an extension SCATTER with the standard deviation of theirs from it",
+        "the PSF that they share",
     ),
     options.STAR_TABLE,
     option(
@@ -149,8 +148,7 @@ def _run(arguments: argparse.Namespace) -> list[str]:
     lines = _lines(stars, arguments.rotate)
     if len(arguments.frames) > 1:
         lines.insert(0, f"{len(arguments.frames)} frames: their stars are laid side by side")
-    scatters = [star.scatter for star in stars if star.scatter is not None]
-    others = {"SCATTER": _squeezed(scatters)} if scatters else {}
+    others = {"SCATTER": _squeezed([star.scatter for star in stars])}
     psfs = _squeezed([star.psf for star in stars])
     used = {"background": stars[0].background}
     _write(arguments, psfs, others, sha256, lines, used, _result_cards(stars))
@@ -353,6 +351,8 @@ COMMAND = Command(
     "make a PSF, or one for each of several angles, from a frame of stars; or check one",
     {"": OPTIONS},
     _run,
-    "The PSFs have unit sum and are for lnocl deconvolve --psf. The background is subtracted and "
+    "The PSFs have unit sum and are for lnocl deconvolve --psf. An extension SCATTER has the "
+    "standard deviation of their pixels, by noise and by how stars differ, which lnocl deconvolve "
+    "reads with them unless --psf-error is 0. The background is subtracted and "
     "the star centred unless you say otherwise; the other steps are done only if you ask for them.",
 )

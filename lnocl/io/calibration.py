@@ -76,7 +76,8 @@ class Calibration(NamedTuple):
         FITS files of the shape of the PSFs that tell how these may be wrong: ideal=FILE, a PSF
         without aberrations; pupil=FILE, the transmission of a pupil in the frequencies of the PSFs,
         its middle at (ky // 2, kx // 2); scatter=FILE, the standard deviation of the pixels of a
-        PSF of unit sum, which the smoothing near stars follows; of these one for all images or one
+        PSF of unit sum, by default the extension SCATTER of the files of PSFs where they have one,
+        as those of ``lnocl psf``, and `psf_error` is not 0; of these one for all images or one
         for each; modes=FILE, a cube of the ways in which all PSFs may differ, one standard
         deviation each. Each may be an extension of its name beside a PSF, as ``lnocl psf`` writes
         SCATTER and MODES.

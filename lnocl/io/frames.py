@@ -13,7 +13,7 @@ from lnocl.core.scene.arrays import Array, Mask
 from lnocl.core.scene.observation import Observation
 from lnocl.core.scene.psfs import check_psfs
 from lnocl.core.scene.transforms import enlarged
-from lnocl.errors import InputError, note
+from lnocl.errors import InputError, counted, note, warn
 from lnocl.io.calibration import Calibration, Word
 from lnocl.io.electrons import Electrons
 from lnocl.io.fitsread import read_extension, read_stack
@@ -27,6 +27,8 @@ from lnocl.io.psf_grids import is_grid, read_grid
 
 # The word for a halo that is the same in all pixels.
 FLAT = "flat"
+# The extension beside a PSF with the standard deviation of its pixels.
+SCATTER = "SCATTER"
 # Of images with more negative pixels than this share the sky was subtracted.
 SUBTRACTED = 0.01
 
@@ -95,7 +97,7 @@ class _Reader:
         self._paths, self._calibration = images, calibration
         self._images, self._maps = self._files.stack, self._files.maps
         self._electrons = Electrons(self._files)
-        self._psfs = read_stack(psfs, calibration.align is not None)
+        self._psf_paths, self._psfs = psfs, read_stack(psfs, calibration.align is not None)
         self._grids = [read_grid(path) for path in psfs if is_grid(path)]
         if len(self._grids) not in (0, len(psfs)):
             raise InputError("give grids of PSFs for all images, or for none")
@@ -173,13 +175,43 @@ class _Reader:
             files.setdefault(kind, []).append(path)
         if len(files.get("modes", ())) > 1:
             raise InputError("the modes are those of all images; give one file of `psf_modes`")
-        found = {}
+        found = dict[str, Any]()
         for kind, paths in files.items():
             stack = read_stack(paths)
             self._maps.sha256.setdefault("psf_errors", []).extend(stack.sha256)
             parts = [read_extension(path, kind.upper()) for path in paths]
             held = [np.atleast_3d(part.T).T for part in parts if part is not None]
             found[PSF_ERRORS[kind]] = np.concatenate(held) if held else stack.data
+        if "scatter" not in files and self._calibration.psf_error and not self._grids:
+            found["psf_scatter"] = self._scatter_beside()
+        return found
+
+    def _scatter_beside(self) -> list[Array] | None:
+        """Return the scatter that files of PSFs have beside them, 0 where others have none.
+
+        Warns
+        -----
+        LnoclWarning
+            It is not of the shape of the PSFs, and left out.
+        """
+        paths, found, n = self._psf_paths, list[Array](), 0
+        psfs = list(_in_own_shapes(self._psfs.data, self._psfs.shapes))
+        of_each = len(psfs) // len(paths)
+        for path in paths:
+            own, part = psfs[len(found) : len(found) + of_each], read_extension(path, SCATTER)
+            planes = [np.zeros(psf.shape) for psf in own]
+            if part is not None and np.atleast_3d(part.T).T.shape == np.shape(own):
+                planes = [
+                    each / psf.sum() for each, psf in zip(np.atleast_3d(part.T).T, own, strict=True)
+                ]
+                n += 1
+            elif part is not None:
+                warn(f"{path} has a {SCATTER} that is not of the shape of its PSF, and is left out")
+            found += planes
+        if not n:
+            return None
+        of_files = counted(n, "file") if n == len(paths) else f"{n} of {len(paths)} files"
+        note(f"{SCATTER}, the error of the pixels of PSFs, is taken from {of_files} of PSFs")
         return found
 
     def _star_psfs(self) -> dict[str, Any]:

@@ -5,6 +5,7 @@ import os
 import shlex
 import subprocess
 import sys
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -183,6 +184,27 @@ class TestWhatItMakes:
         words = shlex.split("\n".join(fits.getheader("out.fits")["HISTORY"]).replace("\\\n", ""))
         assert words.count("--star") == 2
 
+    def test_the_scatter_is_written_and_read_again_unless_psfs_are_exact(self, capsys):
+        """Of one star too; and all that is asked of the result has it."""
+        assert run("--star", "30,29", "--size", "15", output="psf.fits") == 0
+        expected = make_psf(FRAME, (30, 29), 15)
+        np.testing.assert_array_equal(fits.getdata("psf.fits", "SCATTER"), expected.scatter)
+        errors, limits = [], []
+        for error in ("0.01", "0"):
+            words = ["deconvolve", "star.fits", "--psf", "psf.fits", "--star", "50,45", "-o"]
+            words += ["sky.fits", "--overwrite", "--gain", "1", "--background", "40", "--stop"]
+            words += ["none", "--engine", "numpy", "--n-iter", "3", "--psf-error", error]
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", lnocl.LnoclWarning)
+                assert cli.main(words) == 0
+                said = capsys.readouterr().err
+                assert cli.main(["limit", "sky.fits", "--injections", "0"]) == 0
+            assert ("SCATTER, the error of the pixels of PSFs, is taken" in said) == (error != "0")
+            errors.append(fits.getdata("sky.fits", "STARS")["flux_error"][0])
+            limits.append(capsys.readouterr().out)
+        assert errors[0] > errors[1]
+        assert all("is found with a probability of 50 %" in said for said in limits)
+
     def test_several_files_with_a_star_each_give_what_they_share(self, capsys):
         names, chance = [], np.random.default_rng(3)
         for n, x, y, flux in [(31, 15.3, 14.8, 4e6), (35, 18.6, 16.1, 9e6), (33, 16.1, 16.4, 3e6)]:
@@ -258,7 +280,8 @@ class TestTheFile:
         )
         with fits.open("out.fits", checksum=True) as hdus:
             header = hdus[0].header
-            assert len(hdus) == 1
+            assert [hdu.name for hdu in hdus] == ["PRIMARY", "SCATTER"]
+            np.testing.assert_array_equal(hdus[1].data, [star.scatter for star in stars])
         expected = {
             "CREATOR": f"lnocl {lnocl.__version__}",
             "CENTREX": stars[0].centre[0],
@@ -363,8 +386,7 @@ class TestMessages:
     def test_the_largest_crop_is_called_so(self, capsys):
         assert run(frame="sharp.fits") == 0
         k = len(fits.getdata("out.fits"))
-        crop = f"crop: {k} x {k} pixels, the largest square there is"
-        assert crop in capsys.readouterr().out.splitlines()
+        assert f"crop: {k} x {k} pixels, the largest square there is; " in capsys.readouterr().out
 
 
 class TestPicture:

@@ -17,7 +17,9 @@ import lnocl
 from lnocl.core.scene.noise_check import warn_of_noise
 from lnocl.errors import FileError, InputError, LnoclWarning, counted
 from lnocl.io import sky
+from lnocl.io.calibration import Calibration
 from lnocl.io.fitsread import Stack
+from lnocl.io.frames import read_frames
 from lnocl.io.levels import sky_level, sky_noise
 from lnocl.io.pixel_scales import warn_of_pixel_scales
 
@@ -679,3 +681,60 @@ def test_sources_that_fill_a_frame_are_no_read_noise():
     assert found == pytest.approx(10.0, rel=0.1)
     _, median, scatter = sigma_clipped_stats(counts)
     assert np.sqrt(scatter**2 - median) > 11.2  # what it was taken for
+
+
+class TestTheScatterOfPsfs:
+    PSF = np.arange(1.0, 10.0).reshape(3, 3)
+
+    def save(self, path, scatter=None, psf=PSF):
+        hdus = [fits.PrimaryHDU(psf)]
+        if scatter is not None:
+            hdus.append(fits.ImageHDU(scatter, name="SCATTER"))
+        fits.HDUList(hdus).writeto(path, overwrite=True)
+
+    def read(self, *psfs, **known):
+        save_images()
+        known = {"psf_error": 0.03, **known}
+        paths = ["1.fits", "2.fits"]
+        return read_frames(paths, psfs or ["made.fits"], Calibration(**known)).observation
+
+    def test_it_is_read_with_the_psf_and_in_its_unit(self, log):
+        self.save("made.fits", 0.1 * self.PSF)
+        np.testing.assert_allclose(self.read().psf_scatter, [self.PSF / 450] * 2)
+        told = "SCATTER, the error of the pixels of PSFs, is taken from 1 file of PSFs"
+        assert notes(log).count(told) == 1
+
+    def test_cubes_have_cubes(self):
+        psfs = np.array([self.PSF, self.PSF.T])
+        self.save("made.fits", 0.1 * psfs / 45.0, psfs / 45.0)
+        np.testing.assert_allclose(self.read().psf_scatter, 0.1 * psfs / 45.0)
+
+    def test_files_with_it_and_without_may_be_mixed(self, log):
+        self.save("made.fits", self.PSF / 450)
+        self.save("other.fits")
+        found = self.read("other.fits", "made.fits").psf_scatter
+        np.testing.assert_allclose(found, [np.zeros((3, 3)), self.PSF / 45 / 450])
+        assert any("from 1 of 2 files of PSFs" in line for line in notes(log))
+
+    def test_psfs_of_several_shapes_have_it_about_their_centres(self):
+        save_images(**NORTH_UP)
+        self.save("made.fits", np.ones((5, 5)), np.ones((5, 5)))
+        self.save("other.fits", np.ones((3, 3)), np.ones((3, 3)))
+        known = Calibration(psf_error=0.03, align="wcs")
+        found = read_frames(["1.fits", "2.fits"], ["made.fits", "other.fits"], known)
+        other = np.pad(np.full((3, 3), 1 / 9), 1)
+        np.testing.assert_allclose(found.observation.psf_scatter, [np.full((5, 5), 1 / 25), other])
+
+    @pytest.mark.parametrize("known", [{"psf_error": 0.0}, {"psf_errors": ["scatter=map.fits"]}])
+    def test_exact_psfs_and_another_that_is_given_leave_it(self, known, log):
+        self.save("made.fits", 0.1 * self.PSF)
+        save("map.fits", 0.2 * self.PSF)
+        found = self.read(**known).psf_scatter
+        np.testing.assert_allclose(found, [0.2 * self.PSF] * 2 if "psf_errors" in known else found)
+        assert len(found) == 2 * ("psf_errors" in known)
+        assert not any("SCATTER, the error" in line for line in notes(log))
+
+    def test_one_of_another_shape_is_left_out_and_named(self):
+        self.save("made.fits", np.ones((5, 5)))
+        with pytest.warns(LnoclWarning, match=r"made.fits\[0\] has a SCATTER that is not"):
+            assert not len(self.read("made.fits[0]").psf_scatter)

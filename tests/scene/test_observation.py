@@ -3,6 +3,7 @@
 import inspect
 import pickle
 import warnings
+from types import SimpleNamespace
 
 import astropy.units as u
 import numpy as np
@@ -513,6 +514,33 @@ def test_ideal_psfs_are_those_of_the_pupils():
 def test_one_scatter_serves_all_images():
     scatter = observe(psf_scatter=0.1 * PSF).psf_scatter
     np.testing.assert_array_equal(scatter, [0.1 * PSF] * len(IMAGES))
+    assert observe(psf_scatter=0.0 * PSF).psf_scatter.shape == (0, *PSF.shape)
+
+
+def a_made_psf(side=3, share=0.1):
+    psf = np.ones((side, side)) / side**2
+    return SimpleNamespace(psf=psf, scatter=share * psf)
+
+
+def test_psfs_that_were_made_bring_their_scatter():
+    images, made = IMAGES[:2], a_made_psf()
+    for psfs in (made, [made, made]):
+        found = lnocl.Observation(images, psfs, psf_error=0.03)
+        np.testing.assert_array_equal(found.psf_scatter, [made.scatter] * 2)
+        np.testing.assert_array_equal(found.psfs, [made.psf] * 2)
+    told = lnocl.Observation(images, made, psf_error=0.03, psf_scatter=np.full((3, 3), 0.5))
+    np.testing.assert_array_equal(told.psf_scatter, np.full((2, 3, 3), 0.5))
+
+
+def test_exact_psfs_have_no_scatter():
+    assert not len(lnocl.Observation(IMAGES, a_made_psf(), psf_error=0.0).psf_scatter)
+
+
+def test_psfs_of_several_shapes_with_and_without_scatter_may_be_mixed():
+    made, other = a_made_psf(5), np.ones((3, 3))
+    found = lnocl.Observation(np.ones((2, 8, 8)), [other, made], psf_error=0.03)
+    np.testing.assert_array_equal(found.psfs[0], np.pad(other / 9, 1))
+    np.testing.assert_array_equal(found.psf_scatter, [np.zeros((5, 5)), made.scatter])
 
 
 # --- Another observation, checked
@@ -624,7 +652,7 @@ WRONG = {
     "ideal_psfs": [np.ones((5, 5)), np.zeros((3, 3)), np.full((3, 3), np.inf), np.ones((3, 3, 3))],
     "pupils": [-PUPIL, np.zeros((3, 3)), np.ones((2, 5, 5)), np.ones((3, 3, 3))],
     "psf_modes": [np.ones((2, 4, 5, 5)), np.ones(3), np.full((1, 3, 3), np.nan)],
-    "psf_scatter": [-np.ones((2, 3, 3)), np.ones((3, 3, 3)), np.zeros((3, 3))],
+    "psf_scatter": [-np.ones((2, 3, 3)), np.ones((3, 3, 3))],
     "star_psfs": [np.full((3, 3), 0.1), np.full((1, 2, 3, 3), 0.1), np.ones(3)],
     "star_places": [np.ones(3), [(0.0, np.nan)], [(1.0, 1.0)], np.eye(2) * u.arcsec],
 }

@@ -24,7 +24,14 @@ from lnocl.core.scene.fields import (
 from lnocl.core.scene.geometry import MOVES, Box, Geometry, good_box
 from lnocl.core.scene.halos import refuse_dark
 from lnocl.core.scene.psf_field import PsfField, Psfs
-from lnocl.core.scene.psfs import PsfCentre, at_middle, normalised, own
+from lnocl.core.scene.psfs import (
+    MadePsf,
+    PsfCentre,
+    at_middle,
+    normalised,
+    own,
+    without_scatter,
+)
 from lnocl.core.scene.transforms import of_one_shape, shapes_of
 from lnocl.errors import InputError, counted
 from lnocl.notebook import html_card
@@ -58,9 +65,11 @@ class Observation:
         is that of all noise, the source's counts included: what is left without these is the read
         noise. Pixels are bad where it is 0 or not finite. Counts per time are multiplied by the
         exposure. Maps may be masked where the images are; nothing else may hold masked values.
-    psfs : array_like, shape (p, ky, kx) or (ky, kx), or PsfField
+    psfs : array_like, shape (p, ky, kx) or (ky, kx), StarPsf or PsfField
         Point spread functions, with their centres at ``(ky // 2, kx // 2)``. One serves all images.
-        Their sums are positive and are normalised to 1. Negative pixels stay, with a warning. A
+        Their sums are positive and are normalised to 1. Negative pixels stay, with a warning. Those
+        that `lnocl.psf.make_psf` returns, one or a list in which arrays may be too, bring their
+        `psf_scatter`, unless `psf_error` is 0. A
         `lnocl.PsfField` or a `photutils.psf.GriddedPSFModel`, or one for each image, holds PSFs
         that vary over the image. Each star then has the PSF of its own place. The extended source
         has that of the middle; `lnocl.deconvolve_tiles` has one for each tile.
@@ -138,7 +147,9 @@ class Observation:
         standard deviation, in units of PSFs of unit sum.
     psf_scatter : array_like, shape (p, ky, kx) or (ky, kx), optional
         Standard deviation of the pixels of the PSFs, as far as it is known, zero or more, in units
-        of PSFs of unit sum. It serves the noise near stars, and ``refine_psfs`` "pixels".
+        of PSFs of unit sum; 0 where nothing is. It is in the errors of stars and regions. Where
+        `psf_error` is 0, the extended source is smoothed near stars by it, and ``refine_psfs``
+        "pixels" keeps to it. By default that of PSFs of `lnocl.psf.make_psf`.
     psf_error : float, optional
         Relative error that the PSFs may have in their width, one standard deviation, 0 to 0.3;
         0 for exact PSFs, as in simulations. What else they may have wrong follows it
@@ -277,7 +288,7 @@ class Observation:
     def __init__(
         self,
         images: ArrayLike,
-        psfs: ArrayLike | PsfField | Sequence[PsfField],
+        psfs: ArrayLike | PsfField | Sequence[PsfField] | MadePsf | Sequence[MadePsf | ArrayLike],
         *,
         background: ArrayLike = 0.0,
         background_error: ArrayLike = 0.0,
@@ -304,7 +315,11 @@ class Observation:
         shapes = shapes_of(images) if transforms is not None else []
         if len(set(shapes)) > 1:
             given |= in_one_shape(given, shapes)
-        for name in ("psfs", "star_psfs"):
+        given["psfs"], scatter = without_scatter(psfs)
+        if psf_scatter is None and psf_error:
+            given["psf_scatter"] = scatter
+        shapes_of_psfs = shapes_of(given["psfs"])
+        for name in ("psfs", "psf_scatter", "star_psfs"):
             given[name] = of_one_shape(given[name], 0.0, about_centre=True)
         read = hold(self, given, shapes=shapes)
         into = partial(normalised, psf_centre=psf_centre)
@@ -312,7 +327,7 @@ class Observation:
         if self.psf_fields:
             self.psfs = at_middle(self)
         else:
-            self.psfs = into(self.psfs, shapes=shapes_of(psfs))
+            self.psfs = into(self.psfs, shapes=shapes_of_psfs)
         if ideal_psfs is not None:
             self.ideal_psfs = into(self.ideal_psfs)
         with np.errstate(over="ignore"):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -22,6 +22,19 @@ if TYPE_CHECKING:
     from lnocl.core.scene.observation import Observation
 
 PsfCentre = Literal["check", "fit", "given"]
+
+
+class MadePsf(Protocol):
+    """A PSF of unit sum and the standard deviation of its pixels, as a `lnocl.psf.StarPsf` is."""
+
+    @property
+    def psf(self) -> Array:
+        """The PSF, shape (ky, kx)."""
+
+    @property
+    def scatter(self) -> Array:
+        """The standard deviations, shape (ky, kx)."""
+
 
 # Pixels that the core of a PSF may lie off its centre: from the first on a warning is due, from the
 # second on it is refused.
@@ -73,6 +86,24 @@ def read_psfs(field: Field, psfs: Any, held: Observation) -> Array:
     return check_psfs(field.name, psfs, held.n_images)
 
 
+def without_scatter(psfs: Any) -> tuple[Any, Any]:
+    """Return PSFs as arrays, and the scatter that those of `lnocl.psf.make_psf` carry, or None.
+
+    That of others among them is 0.
+    """
+    each = psfs if isinstance(psfs, (list, tuple)) else [psfs]
+    are_made = [hasattr(one, "psf") and hasattr(one, "scatter") for one in each]
+    if not any(are_made):
+        return psfs, None
+    pairs = [
+        (one.psf, one.scatter) if is_made else (one, np.zeros(np.shape(one)))
+        for one, is_made in zip(each, are_made, strict=True)
+    ]
+    if each is not psfs:
+        return pairs[0]
+    return [psf for psf, _ in pairs], [scatter for _, scatter in pairs]
+
+
 def read_ideal_psfs(field: Field, ideals: Any, held: Observation) -> Array:
     """Return PSFs without aberrations, by default those of pupils; (0, ky, kx) for none."""
     if ideals is None and len(held.pupils):
@@ -93,11 +124,12 @@ def read_ideal_psfs(field: Field, ideals: Any, held: Observation) -> Array:
 def read_pixels(field: Field, values: Any, held: Observation) -> Array:
     """Return a number for each pixel of each PSF, shape (p, ky, kx), or (0, ky, kx) for none.
 
-    Of `psf_modes` there are several for each PSF, shape (p, n, ky, kx), which may be negative.
+    Of `psf_modes` there are several for each PSF, shape (p, n, ky, kx), which may be negative. A
+    `psf_scatter` of 0 is none.
     """
     name, (p, *shape) = field.name, held.psfs.shape
-    are_modes = name == "psf_modes"
-    if values is None:
+    are_modes, may_be_dark = name == "psf_modes", name in ("psf_modes", "psf_scatter")
+    if values is None or (name == "psf_scatter" and not np.any(values)):
         return np.zeros((p, 0, *shape) if are_modes else (0, *shape))
     given = numbers(name, bare(name, values))
     if given.ndim == 2 + are_modes:
@@ -111,7 +143,7 @@ def read_pixels(field: Field, values: Any, held: Observation) -> Array:
     if not np.isfinite(given).all() or (not are_modes and (given < 0).any()):
         kind = "" if are_modes else "negative or "
         raise InputError(f"`{name}` hold values that are {kind}not finite; repair them first")
-    if not (are_modes or given.any(axis=(1, 2)).all()):
+    if not (may_be_dark or given.any(axis=(1, 2)).all()):
         raise InputError(f"`{name}` hold a map that is all 0; leave `{name}` out, or give another")
     return np.broadcast_to(given, (p, *given.shape[1:])).copy()
 
