@@ -36,8 +36,8 @@ class StarPsf:
     shared_steps : tuple of str
         One line for each step that PSFs at all angles share, in order, with its numbers.
     own_steps : tuple of str
-        The same for the other steps. The flux left out of the crop is measured with the noise of
-        all pixels of that square.
+        The same for the other steps. The light beyond the crop is what the edge of the PSF tells
+        (`lnocl.core.scene.psf_edge`), as `lnocl.deconvolve` takes it.
     flux : float
         Flux of the PSF before it was normalised, in the unit of the frame; that of all its stars.
     centres : tuple of tuple of float
@@ -268,7 +268,7 @@ def make_psf(
     background: 100, as given, subtracted
     bad pixels: 0 in the frame
     centre: x = 23.300, y = 18.800, FWHM 4.71 pixels; shifted by x -0.300, y 0.200
-    crop: 21 x 21 pixels; 0.00 % of the flux in the largest square there is, 39 x 39, left out
+    crop: 21 x 21 pixels; by its edge 0.00 % +- 0.00 % of its light is beyond
     negative pixels: 0, 0.00 % of the flux; left as they are
     normalised: flux 125664 set to 1
     """

@@ -12,6 +12,7 @@ from scipy.ndimage import label, maximum_filter, value_indices
 
 from lnocl.core.scene.apertures import FWHM
 from lnocl.core.scene.arrays import Array, Mask, numbers
+from lnocl.core.scene.psf_edge import LEAST_RADIUS, psf_edge
 from lnocl.core.scene.shifting import ENDLESS, MARGIN, MovablePsf
 from lnocl.detection.fitting import fit
 from lnocl.detection.maxima import SIGNIFICANT
@@ -329,23 +330,22 @@ def rotate_square(work: Array, angle: float, radius: int) -> tuple[Array, str]:
 def crop_square(
     work: Array, side: int, light: Array, pixel: Pixel, level: float
 ) -> tuple[Array, str]:
-    """Return the PSF; the line says which share of the flux is outside it."""
+    """Return the PSF; the line says which share of its light is outside it, as its edge tells."""
     psf = middle_square(work, side).copy()
-    largest = _largest(light.shape, pixel, 0.0)
-    y, x = (slice(i - largest // 2, i - largest // 2 + largest) for i in pixel)
-    flux, whole = float(psf.sum()), float(light[y, x].sum())
+    flux = float(psf.sum())
     if not flux > 0:
         raise InputError(
             f"the flux of the PSF above the background {level:g} is {flux:g}; give another "
             "position or a lower background"
         )
-    if side == largest:
-        return psf, f"crop: {side} x {side} pixels, the largest square there is"
-    left_out = _percent(1 - flux / whole) + " of the flux" if whole > 0 else "an unknown share"
-    return psf, (
-        f"crop: {side} x {side} pixels; {left_out} in the largest square there is, "
-        f"{largest} x {largest}, left out"
-    )
+    line = f"crop: {side} x {side} pixels"
+    if side == _largest(light.shape, pixel, 0.0):
+        line += ", the largest square there is"
+    edge = psf_edge(psf)
+    if edge.radius < LEAST_RADIUS:
+        return psf, f"{line}; too few to tell the light beyond"
+    beyond = f"{_percent(edge.share)} +- {_percent(edge.light_error)}"
+    return psf, f"{line}; by its edge {beyond} of its light is beyond"
 
 
 def warn_of_guess(saturated: Mask, light: Array, pixel: Pixel, side: int) -> None:
