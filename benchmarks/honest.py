@@ -1,6 +1,6 @@
 """Star fluxes in their own stated errors, where PSFs, counts and zero points are not as given.
 
-    python benchmarks/honest.py [LINE ...] [--seeds FIRST LAST] [--psf-error SHARE]
+    python benchmarks/honest.py [LINE ...] [--seeds FIRST LAST] [--psf-error SHARE] [--no-scatter]
         [--output FILE.ecsv]
 
 Backgrounds are right, stars are given where they are unless a line says otherwise, and all else is
@@ -22,6 +22,7 @@ from typing import NamedTuple
 
 import numpy as np
 from astropy.table import Table
+from scipy.ndimage import map_coordinates
 
 import lnocl
 from lnocl.psf import make_psf
@@ -218,11 +219,33 @@ def epochs(rng, off=(3.0, -4.0), made=None, nights=6, n=64):
     return Scene(images, psfs, known, [star], fluxes, 1e5)
 
 
-def of_three_stars(rng, true, flux=1e5, n=120):
-    """Return the PSF that lnocl makes of three stars of a frame."""
-    stars = np.array([(31, 33), (86, 38), (52, 87)]) + rng.uniform(-0.5, 0.5, (3, 2))
-    frame = rng.poisson(100 + seen(n, true, stars, flux * rng.uniform(0.5, 1.5, 3)))
-    return make_psf(frame, stars, size=33).psf
+def of_stars(rng, true, n_stars=3, flux=1e5, vary=0.0):
+    """Return the PSF that lnocl makes of stars of a frame, whose widths may vary."""
+    size, n = len(true) - 8, 160
+    places = [(31, 33), (86, 38), (52, 87), (126, 34), (118, 80), (30, 128), (78, 130), (126, 124)]
+    stars = np.array(places[:n_stars]) + rng.uniform(-0.5, 0.5, (n_stars, 2))
+    frame = np.full((n, n), 100.0)
+    for star, of_star in zip(stars, flux * rng.uniform(0.5, 1.5, n_stars), strict=True):
+        step = 1 + vary * rng.standard_normal()
+        y, x = (np.indices(true.shape) - len(true) // 2) / step + len(true) // 2
+        own = map_coordinates(true, [y, x], order=5) if vary else true
+        frame += seen(n, own / own.sum(), [star], [of_star])
+    return make_psf(rng.poisson(frame), stars, size=size)
+
+
+def beside_made(rng, kind, n=64, **made):
+    """Return a star of 1e5 alone, beside a companion of 3 % or on a host, with a made PSF."""
+    star, turn = middle(rng, n), rng.uniform(0, 2 * np.pi)
+    true, stars, fluxes, sky = psf(41, 3.4, stretch=1.15), [star], [1e5], None
+    if kind == "companion":
+        stars = [star, star + 7 * np.array([np.cos(turn), np.sin(turn)])]
+        fluxes = [1e5, 3e3]
+    if kind == "host":
+        sky = blob(n, 5e4, star, 4.0, 1.0, 1.3)
+    image = rng.poisson(100 + seen(n, true, stars, fluxes, sky))
+    given = of_stars(rng, true, **made)
+    light = 0.0 if sky is None else sky.sum()
+    return Scene(image, given, {"background": 100.0}, stars, fluxes, light)
 
 
 def rolls(rng, wrong=1.05, n=44):
@@ -312,7 +335,7 @@ LINES = {
     "zero-points-nights": partial(zero_points, each_night=True),
     "epochs-off-nucleus": epochs,
     "epochs-on-nucleus": partial(epochs, off=(0.0, 0.0)),
-    "curves-made-psfs": partial(epochs, made=of_three_stars),
+    "curves-made-psfs": partial(epochs, made=of_stars),
     "rolls-wide": rolls,
     "rolls-narrow": partial(rolls, wrong=0.95),
     "tiles": tiles,
@@ -323,6 +346,11 @@ LINES = {
     "dithers": partial(undersampled, width=1.3, p=8),
     "dithers-coarse": partial(undersampled, width=1.3, p=8, q=1),
     "companion": companion,
+    **{
+        f"made-{kind}-{k}": partial(beside_made, kind=kind, n_stars=k, flux=3e4, vary=0.01)
+        for kind in ("alone", "companion", "host")
+        for k in (1, 2, 3, 8)
+    },
     "exact-alone": exact,
     "exact-jet": partial(exact, kind="jet"),
     "exact-ring": partial(exact, kind="ring"),
@@ -354,9 +382,18 @@ def run(scene, **options):
     return result, *found, *light, kappa, list(dict.fromkeys(told))
 
 
-def measure(line, seed, **options):
+def without_scatter(psfs):
+    """Return PSFs, those that lnocl made without their scatter."""
+    if isinstance(psfs, list):
+        return [getattr(each, "psf", each) for each in psfs]
+    return getattr(psfs, "psf", psfs)
+
+
+def measure(line, seed, scatter=True, **options):
     """Print a run, and yield a row for each flux."""
     scene = LINES[line](np.random.default_rng([seed, zlib.crc32(line.encode())]))
+    if not scatter:
+        scene = scene._replace(psfs=without_scatter(scene.psfs))
     begun = time.perf_counter()
     _, found, errors, light, light_error, kappa, told = run(scene, **options)
     seconds = time.perf_counter() - begun
@@ -432,12 +469,13 @@ def main():
     parser.add_argument("lines", nargs="*", metavar="LINE", help=", ".join(LINES))
     parser.add_argument("--seeds", type=int, nargs=2, default=(0, 4), metavar=("FIRST", "LAST"))
     parser.add_argument("--psf-error", type=float, help="that of deconvolve, which has to have it")
+    parser.add_argument("--no-scatter", action="store_true", help="that of PSFs made is not given")
     parser.add_argument("--output", metavar="FILE.ecsv")
     given = parser.parse_args()
     rows = []
     for line in given.lines or LINES:
         for seed in range(given.seeds[0], given.seeds[1] + 1):
-            rows += measure(line, seed, **options_of(given))
+            rows += measure(line, seed, not given.no_scatter, **options_of(given))
             if given.output:
                 Table(rows).write(given.output, overwrite=True)
     summarise(Table(rows)).pprint(max_lines=-1, max_width=-1)
