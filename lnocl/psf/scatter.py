@@ -17,10 +17,12 @@ FOURTH = np.array([1.0, -4.0, 6.0, -4.0, 1.0])
 DIFFERENCES = FOURTH[:, None] * FOURTH
 # Rounds in which variances are found.
 ROUNDS = 200
-# A pixel has this share of the mean variance at least.
-LEAST = 1e-9
+# Interpolation is right to this share of a peak, which is the noise at least.
+LEAST = 1e-6
 # Stars differ in proportion to the PSF smoothed over so many pixels, as widths beside the peak do.
 SMOOTHED = 1.0
+# Noise that neighbours share has up to so many times the variance that they show.
+SHARED = 10.0
 # Where no star shows a pixel, it is known to this share of the light there and opposite.
 GUESSED = 0.2
 
@@ -49,7 +51,8 @@ def of_one(light: Array, bad: Mask, pixel: Pixel, half: int) -> Array:
     near = convolve(square, kernel, mode="nearest").clip(0.0)
     good = ~maximum_filter(guessed, 5)
     good[[0, 1, -2, -1]] = good[:, [0, 1, -2, -1]] = False
-    found = _variances(squares[good], np.array([np.ones_like(near), near])[:, good])
+    design = np.array([np.ones_like(near), near])[:, good]
+    found = _variances(squares[good], design, square.max())
     sky, of_light = _raised(found, light, bad)
     variance = sky + of_light * square.clip(0.0)
     return np.sqrt(variance + np.where(guessed, _guess(square), 0.0) ** 2)
@@ -93,15 +96,18 @@ def of_several(
         ((1.0 - 2.0 * share) * noise * form + mean)[used]
         for (noise, form), mean in zip(forms, of_mean, strict=True)
     ]
-    found = _raised(_variances(apart[used] ** 2, np.array(design)), light, bad)
+    found = _variances(apart[used] ** 2, np.array(design), psf.max())
+    found = _raised(found, light, bad)
     found[2] *= (n + 1) / (n - 1)
     variance = np.tensordot(found, of_mean, axes=1) + found[2] * wide**2
     least = found[0] / fluxes.max() ** 2
     return np.sqrt(np.where(weight > 0, variance, least + _guess(psf) ** 2))
 
 
-def _variances(squares: Array, design: Array) -> Array:
+def _variances(squares: Array, design: Array, peak: float) -> Array:
     """Return the amounts of the rows of a design that make squares of Gaussian noise likeliest.
+
+    Noise is `LEAST` of the peak at least.
 
     References
     ----------
@@ -112,9 +118,9 @@ def _variances(squares: Array, design: Array) -> Array:
     if not (mean > 0 and (sums > 0).all()):
         return np.zeros(len(design))
     design, squares = design / sums[:, None], squares / mean
-    found = np.full(len(design), squares.size / len(design))
+    found, least = np.full(len(design), squares.size / len(design)), (LEAST * peak) ** 2 / mean
     for _ in range(ROUNDS):
-        variance = np.maximum(found @ design, LEAST)
+        variance = np.maximum(found @ design, least)
         found *= np.sqrt((design @ (squares / variance**2)) / (design @ (1.0 / variance)))
     return np.asarray(mean * found / sums)
 
@@ -130,7 +136,7 @@ def _raised(found: Array, light: Array, bad: Mask) -> Array:
         dark = max(noise.variance, noise.variance_apart)
     raised = found.copy()
     if found[0] > 0:
-        raised[:2] *= max(1.0, dark / found[0])
+        raised[:2] *= np.clip(dark / found[0], 1.0, SHARED)
     raised[0] = max(found[0], dark)
     return raised
 

@@ -316,12 +316,10 @@ def test_a_place_without_a_star_is_refused():
         lnocl.plan(observe(), [PLANET, np.add(STAR, (0.0, 0.6))])
 
 
-@pytest.mark.parametrize("name", ["refine_psfs", "psf_scatter"])
-def test_psfs_are_not_judged_by_a_star_that_has_its_own(name):
-    changes = {"psf_scatter": 0.1 * PSFS} if name == "psf_scatter" else {}
-    options = {"refine_psfs": ["jitter"]} if name == "refine_psfs" else {}
-    with pytest.raises(lnocl.InputError, match=f"{name} (needs a star|is the error of PSFs at)"):
-        lnocl.deconvolve(observe(**changes), [STAR], engine="numpy", **options)
+def test_psfs_are_not_judged_by_a_star_that_has_its_own():
+    with pytest.raises(lnocl.InputError, match="refine_psfs needs a star"):
+        lnocl.deconvolve(observe(), [STAR], engine="numpy", refine_psfs=["jitter"])
+    assert not lnocl.plan(observe(psf_scatter=0.1 * PSFS), [STAR]).judges_psfs
     alone, both = lnocl.plan(observe(), [STAR]), lnocl.plan(observe(), [STAR, PLANET])
     assert alone.why_not("judge PSFs before the run") == "all stars have PSFs of their own"
     assert alone.does("take marginal star fluxes")
