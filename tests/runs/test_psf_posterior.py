@@ -1,10 +1,13 @@
 """PSFs that are not as given: what stars show of them is used, and the rest is in the errors."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
 import lnocl
+from lnocl.core.runs.outcome import PsfRefinement
 from lnocl.core.scene.cores import fwhm
 
 N, STAR, FLUX, LEVEL = 60, (28.3, 31.6), 3e5, 40.0
@@ -104,6 +107,15 @@ def test_errors_grow_with_what_psfs_may_have():
     ]
     assert errors == sorted(errors)
     assert errors[3] > 3 * errors[1]
+
+
+@pytest.mark.parametrize(("error", "share"), [(0.0, 0.2), (0.03, 0.0)])
+def test_an_error_that_is_left_counts_in_fluxes_where_psfs_are_said_to_be_exact(error, share):
+    found = solve(1.0, error, refine_psfs=(), n_iter=5, stop=None)._outcome
+    none = np.zeros(0)
+    left = PsfRefinement((), np.zeros((2, 0)), (1.0, 1.0), False, 0.2, none, none, none)
+    before, after = (replace(found, psf_refinement=each).star_errors()[0] for each in (None, left))
+    np.testing.assert_allclose(after, np.hypot(before, share * found.star_fluxes), rtol=1e-12)
 
 
 def test_images_are_windows_of_one_observation_with_its_error():
