@@ -9,6 +9,7 @@ from scipy.ndimage import gaussian_filter
 import lnocl
 from lnocl.core.runs import psf_posterior
 from lnocl.core.runs.outcome import PsfRefinement
+from lnocl.core.runs.psf_refinement import mend
 from lnocl.core.runs.start import Setup
 from lnocl.core.scene.cores import fwhm
 from lnocl.core.scene.penalty import Penalty, recommend_smoothing
@@ -52,6 +53,10 @@ def observe(widths, given, seed=0, sky=KNOTS, stars=(STAR,), **known):
         images.append(rng.poisson((depth * light + LEVEL).clip(0)))
     psfs = [psf(width) for width in given]
     return lnocl.Observation(images, psfs, background=LEVEL, psf_centre="given", **known)
+
+
+def setup_of(observation, stars=(STAR,)):
+    return Setup(observation, np.array(stars), 0, "sgp", "double", "numpy", None)
 
 
 RUN = {"engine": "numpy"}
@@ -123,6 +128,16 @@ def test_an_error_that_is_left_counts_in_fluxes_where_psfs_are_said_to_be_exact(
     np.testing.assert_allclose(after, np.hypot(before, share * found.star_fluxes), rtol=1e-12)
 
 
+def test_a_companion_is_not_taken_for_the_psf_where_little_is_wrong():
+    companion = np.where((X == 32) & (Y == 32), 0.02 * FLUX, 0.0)
+    known = {"exposure": DEPTHS[:1], "psf_error": 0.03}
+    observation = observe(TRUE[:1], [TRUE[0] / 1.05], sky=companion, **known)
+    with pytest.warns(lnocl.errors.LnoclWarning, match="the PSFs do not fit"):
+        found = mend(setup_of(observation), ("pixels",), False, False)
+    assert fwhm(found.setup.observation.psfs[0]) > 1.02 * fwhm(observation.psfs[0])
+    assert not found.refinement.has_free_pixels
+
+
 def test_images_are_windows_of_one_observation_with_its_error():
     observation = lnocl.Observation(np.ones((8, 8)), np.ones((3, 3)), psf_error=0.05)
     assert observation.psf_error == 0.05
@@ -152,9 +167,8 @@ def test_a_file_that_ends_early_leaves_the_light_beyond_in_the_error():
 
 
 def settle(observation, stars=(STAR,)):
-    setup = Setup(observation, np.array(stars), 0, "sgp", "double", "numpy", None)
     penalty = Penalty(smoothing=recommend_smoothing(observation))
-    return psf_posterior.settle_psfs(setup, penalty)
+    return psf_posterior.settle_psfs(setup_of(observation, stars), penalty)
 
 
 def test_several_stars_tell_of_one_psf_and_rounds_settle():
