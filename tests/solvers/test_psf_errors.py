@@ -164,6 +164,11 @@ def test_zero_points_are_of_images_of_one_epoch_and_are_none_together():
     expected = np.eye(2) + COMMON**-2
     np.testing.assert_allclose(errors.prior[-2:, -2:], expected)
     np.testing.assert_array_equal(errors.prior[:-2, :-2], np.eye(N_SLOPES))
+    assert len(errors.slopes(0, views[0].model(estimate))[0]) == N_SLOPES
+    model = views[1].model(estimate)
+    slopes, unknowns = errors.slopes(1, model)
+    np.testing.assert_allclose(slopes[-1], ZERO_POINTS * 0.03 * (model - views[1].background))
+    assert unknowns[-1] == N_SLOPES
 
 
 def test_theta_of_two_psfs_is_correlated_and_each_has_its_own_variance():
@@ -172,11 +177,6 @@ def test_theta_of_two_psfs_is_correlated_and_each_has_its_own_variance():
     prior = PsfErrors(estimate, views, {}).prior[: 2 * N_SLOPES, : 2 * N_SLOPES]
     expected = np.kron([[1.0, ALIKE], [ALIKE, 1.0]], np.eye(N_SLOPES))
     np.testing.assert_allclose(np.linalg.inv(prior), expected, rtol=0, atol=1e-12)
-    assert len(errors.slopes(0, views[0].model(estimate))[0]) == N_SLOPES
-    model = views[1].model(estimate)
-    slopes, unknowns = errors.slopes(1, model)
-    np.testing.assert_allclose(slopes[-1], ZERO_POINTS * 0.03 * (model - views[1].background))
-    assert unknowns[-1] == N_SLOPES
 
 
 def test_light_beyond_a_file_is_an_unknown_where_images_are_larger():

@@ -15,6 +15,7 @@ from lnocl.core.scene.view import View, Window
 from lnocl.core.solvers import least_squares, near_star
 from lnocl.core.solvers.near_star import CUSP, DEVIATION
 from lnocl.core.solvers.psf_errors import (
+    ALIKE,
     COMMON,
     CORRELATED,
     PIXELS,
@@ -85,9 +86,9 @@ def doubts(scene, sky, fluxes):
         star = CUSP * sky[is_round].sum() * light(psfs, np.eye(len(fluxes))[s])
         columns.append([gaussian_filter(each, width * DEVIATION, mode="wrap") for each in star])
     slopes = np.array([slopes_of(psf, error) for psf in psfs])
-    columns += [
-        j * (light(psfs + each) - own) for j in images for each in np.moveaxis(slopes, 1, 0)
-    ]
+    root = np.linalg.cholesky((1.0 - ALIKE) * np.eye(p) + ALIKE)
+    changes = [light(psfs + each) - own for each in np.moveaxis(slopes, 1, 0)]
+    columns += [each[:, None, None] * change for each in root.T for change in changes]
     root = np.linalg.cholesky(np.linalg.inv(np.eye(p) + COMMON**-2))
     sources = Model(scene).images(sky, fluxes) - scene.background()[:, None, None]
     columns += [ZERO_POINTS * error * each[:, None, None] * sources for each in root.T]
