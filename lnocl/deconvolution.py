@@ -401,16 +401,16 @@ def deconvolve(
 
 def _finish(outcome: Outcome, plan: Plan, prepared: Prepared, progress: bool) -> Outcome:
     """Return an outcome with what the plan has marginal, and how well PSFs fit."""
-    is_fit = prepared.fits
+    is_within = prepared.is_within
     if plan.does(STARS) and not plan.does(PSFS):  # as all stars have PSFs of their own
-        is_fit = not any(star.is_misfit for star in outcome.star_residuals())
+        is_within = not any(star.is_misfit for star in outcome.star_residuals())
     if prepared.stop == "held-out" and outcome.stop_reason not in ("held-out", "callback"):
-        is_fit = False  # what leaves them without an end leaves marginal fluxes without sense
+        is_within = False  # what leaves them without an end leaves marginal fluxes without sense
     has_halos, has_levels = plan.does(HALOS), plan.does(LEVELS)
-    if is_fit or has_halos or has_levels:
+    if is_within or has_halos or has_levels:
         what = "fitting stars, halos and levels"
         with quietly(), Progress(None, "", bool(progress), what, stays=False):
-            outcome = outcome.marginal(is_fit, has_halos, has_levels)
+            outcome = outcome.marginal(is_within, has_halos, has_levels)
     for words in outcome.levels_in_words():
         note("%s", words)
     return replace(

@@ -261,7 +261,7 @@ def deconvolve_tiles(
     prepared = prepared.of(observed[0].observation, observed[0].stars, pad=pad)
     chosen = None
     if isinstance(prepared.stop, str):
-        chosen = _choose(observed, parallel, replace(prepared, fits=False))
+        chosen = _choose(observed, parallel, replace(prepared, is_within=False))
         prepared = _ending(prepared, chosen)
     mosaic = _Mosaic(observation, positions, replace(plan, found=prepared.found), tiles[0])
     with (
@@ -282,7 +282,7 @@ def _ending(prepared: Prepared, choice: Result) -> Prepared:
     penalty = replace(prepared.penalties[0], smoothing=choice.smoothing)
     prepared = replace(prepared, penalties=[penalty], n_iter=max(choice.n_iter, 1))
     if choice.stop_reason != prepared.stop:  # there was no end, and this is the steady run
-        prepared = replace(prepared, steady=None, fits=False)
+        prepared = replace(prepared, steady=None, is_within=False)
     return replace(prepared, stop=None)
 
 
@@ -322,7 +322,7 @@ def _alone(result: Result, **changes: Any) -> Result:
 def _outcome(prepared: Prepared, tile: Tile) -> Outcome:
     prepared = prepared.of(tile.observation, tile.stars).penalised(near_stars=tile.near_stars)
     outcome = reconstruct(prepared, own=tile.own)
-    if prepared.fits and len(tile.stars):
+    if prepared.is_within and len(tile.stars):
         outcome = outcome.marginal(stars=True, halos=False, levels=False)
     return replace(outcome, psf_refinement=prepared.refinement)
 

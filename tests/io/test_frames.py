@@ -671,6 +671,11 @@ class TestPixelScales:
         assert self.said({"PIXELSCL": 0.0125}, {}) == []
 
 
+def test_observations_have_the_error_of_psfs_that_is_given():
+    save_images()
+    assert observe(psf_error=0.07).psf_error == 0.07
+
+
 def test_sources_that_fill_a_frame_are_no_read_noise():
     y, x = np.indices((128, 128))
     rng = np.random.default_rng(4)

@@ -7,7 +7,7 @@ import pytest
 from regions import CirclePixelRegion, PixCoord
 
 import lnocl
-from lnocl.core.runs.psf_refinement import _is_trusted, _State
+from lnocl.core.runs.psf_refinement import _is_trusted, _settle, _State
 from lnocl.core.scene.psf_families import PsfFamilies
 from lnocl.core.scene.psf_misfit import PsfMisfit
 from lnocl.errors import LnoclWarning
@@ -122,6 +122,16 @@ def test_psfs_that_leave_no_star_to_judge_by_are_refused():
     assert before.is_mended_by(state(0.02, 0.9e4, seen=0.6))
     assert not before.is_mended_by(state(0.0, 0.9e4, seen=0.4))
     assert not before.is_mended_by(state(0.19, 1e4))
+
+
+def test_psfs_that_stars_show_are_used_unless_they_fit_worse():
+    before, psfs = state(0.2, 1e4), PSF.copy()
+    for kappa, is_used in ((0.1, True), (0.21, True), (0.25, False)):
+        runs = SimpleNamespace(stars=None, settled=lambda _: psfs)
+        runs.fit = lambda *_, kappa=kappa: state(kappa, 1e4).estimate
+        found = _settle(runs, before)
+        assert found.psfs is (psfs if is_used else PSF)
+        assert found.misfit.kappa == pytest.approx(kappa if is_used else 0.2)
 
 
 def test_free_pixels_are_refused_that_fit_in_part_or_change_a_flux_by_more_than_the_error():

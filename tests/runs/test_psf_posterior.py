@@ -1,11 +1,19 @@
 """PSFs that are not as given: what stars show of them is used, and the rest is in the errors."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
 import lnocl
+from lnocl.core.runs import psf_posterior
+from lnocl.core.runs.outcome import PsfRefinement
+from lnocl.core.runs.psf_refinement import mend
+from lnocl.core.runs.start import Setup
 from lnocl.core.scene.cores import fwhm
+from lnocl.core.scene.penalty import Penalty, recommend_smoothing
+from lnocl.core.solvers.psf_errors import with_errors
 
 N, STAR, FLUX, LEVEL = 60, (28.3, 31.6), 3e5, 40.0
 Y, X = np.indices((N, N))
@@ -22,28 +30,33 @@ def psf(width, n=41, shift=(0.0, 0.0), beta=3.5):
     return values / values.sum()
 
 
-def at(kernel, flux):
-    """Return the star through a PSF, moved by its spectrum."""
+def at(kernel, flux, star):
+    """Return a star through a PSF, moved by its spectrum."""
     n = len(kernel)
     laid = np.zeros((3 * N, 3 * N))
     laid[:n, :n] = kernel
     v, u = np.fft.fftfreq(3 * N)[:, None], np.fft.rfftfreq(3 * N)
-    x, y = STAR[0] - n // 2, STAR[1] - n // 2
+    x, y = star[0] - n // 2, star[1] - n // 2
     moved = np.fft.rfft2(laid) * np.exp(-2j * np.pi * (u * x + v * y))
     return flux * np.fft.irfft2(moved, laid.shape)[:N, :N]
 
 
-def observe(widths, given, seed=0, sky=KNOTS, **known):
+def observe(widths, given, seed=0, sky=KNOTS, stars=(STAR,), **known):
     rng, images = np.random.default_rng(seed), []
     for width, depth in zip(widths, known["exposure"], strict=True):
         kernel = psf(width)
         shape = (3 * N, 3 * N)
         light = np.fft.irfft2(np.fft.rfft2(sky, shape) * np.fft.rfft2(kernel, shape), shape)
         half = len(kernel) // 2
-        light = light[half : half + N, half : half + N] + at(kernel, FLUX)
+        light = light[half : half + N, half : half + N]
+        light += sum(at(kernel, FLUX, star) for star in stars)
         images.append(rng.poisson((depth * light + LEVEL).clip(0)))
     psfs = [psf(width) for width in given]
     return lnocl.Observation(images, psfs, background=LEVEL, psf_centre="given", **known)
+
+
+def setup_of(observation, stars=(STAR,)):
+    return Setup(observation, np.array(stars), 0, "sgp", "double", "numpy", None)
 
 
 RUN = {"engine": "numpy"}
@@ -106,6 +119,25 @@ def test_errors_grow_with_what_psfs_may_have():
     assert errors[3] > 3 * errors[1]
 
 
+@pytest.mark.parametrize(("error", "share"), [(0.0, 0.2), (0.03, 0.0)])
+def test_an_error_that_is_left_counts_in_fluxes_where_psfs_are_said_to_be_exact(error, share):
+    found = solve(1.0, error, refine_psfs=(), n_iter=5, stop=None)._outcome
+    none = np.zeros(0)
+    left = PsfRefinement((), np.zeros((2, 0)), (1.0, 1.0), False, 0.2, none, none, none)
+    before, after = (replace(found, psf_refinement=each).star_errors()[0] for each in (None, left))
+    np.testing.assert_allclose(after, np.hypot(before, share * found.star_fluxes), rtol=1e-12)
+
+
+def test_a_companion_is_not_taken_for_the_psf_where_little_is_wrong():
+    companion = np.where((X == 32) & (Y == 32), 0.02 * FLUX, 0.0)
+    known = {"exposure": DEPTHS[:1], "psf_error": 0.03}
+    observation = observe(TRUE[:1], [TRUE[0] / 1.05], sky=companion, **known)
+    with pytest.warns(lnocl.errors.LnoclWarning, match="the PSFs do not fit"):
+        found = mend(setup_of(observation), ("pixels",), False, False)
+    assert fwhm(found.setup.observation.psfs[0]) > 1.02 * fwhm(observation.psfs[0])
+    assert not found.refinement.has_free_pixels
+
+
 def test_images_are_windows_of_one_observation_with_its_error():
     observation = lnocl.Observation(np.ones((8, 8)), np.ones((3, 3)), psf_error=0.05)
     assert observation.psf_error == 0.05
@@ -132,3 +164,36 @@ def test_a_file_that_ends_early_leaves_the_light_beyond_in_the_error():
         observation = lnocl.Observation(image, cut, background=60.0, psf_error=error)
         found = lnocl.deconvolve(observation, [(36, 36)], **RUN)
         assert (abs(found.star_fluxes - 1e6) < 3 * found.star_flux_errors).item() == is_honest
+
+
+def settle(observation, stars=(STAR,)):
+    penalty = Penalty(smoothing=recommend_smoothing(observation))
+    return psf_posterior.settle_psfs(setup_of(observation, stars), penalty)
+
+
+def test_several_stars_tell_of_one_psf_and_rounds_settle():
+    """Two near each other, so that their windows have more unknowns than that of the other."""
+    stars = (12.3, 14.6), (40.2, 21.7), (46.8, 18.4)
+    given = [width / 1.1 for width in TRUE]
+    observation = observe(TRUE, given, stars=stars, exposure=DEPTHS, psf_error=0.03)
+    steps = settle(observation, stars)
+    found = with_errors(observation, sum(steps)).psfs
+    widths = [fwhm(after) / fwhm(psf(width)) for after, width in zip(found, given, strict=True)]
+    assert widths == pytest.approx([1.1, 1.1], abs=0.02)
+    assert abs(steps[-1]).max() < 0.15 * abs(steps[0]).max()
+
+
+def test_psfs_narrower_than_two_pixels_stay(monkeypatch):
+    monkeypatch.setattr(psf_posterior, "ROUNDS", 1)
+    widths, given = (1.8, 3.6), (1.7, 3.4)
+    [step] = settle(observe(widths, given, exposure=DEPTHS, psf_error=0.03))
+    assert not step[0].any()
+    assert abs(step[1]).max() > 0.5
+    assert not settle(observe(widths[:1], given[:1], exposure=DEPTHS[:1], psf_error=0.03))
+
+
+def test_a_star_with_a_psf_of_its_own_tells_nothing_of_the_others(monkeypatch):
+    monkeypatch.setattr(psf_posterior, "ROUNDS", 1)
+    own = {"star_places": [STAR], "star_psfs": psf(TRUE[0] / 1.1)}
+    [step] = settle(observe(TRUE[:1], TRUE[:1], exposure=DEPTHS[:1], psf_error=0.03, **own))
+    assert not step.any()

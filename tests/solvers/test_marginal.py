@@ -92,6 +92,14 @@ def test_a_star_that_nothing_determines_stays():
     np.testing.assert_array_equal(found_sky, sky)
 
 
+def test_psfs_that_may_be_wrong_are_held():
+    sky, fluxes = with_hole()
+    exact = after_step(a_scene(), sky, fluxes)
+    for doubted in ({"psf_error": 0.03}, {"psf_scatter": 0.1 * PSF}):
+        for found, expected in zip(after_step(a_scene(**doubted), sky, fluxes), exact, strict=True):
+            np.testing.assert_array_equal(found, expected)
+
+
 def test_no_flux_is_negative_and_none_comes_back():
     """Where the images show nothing of a star that the estimate has, or has no more."""
     scene = a_scene(fluxes=np.array([0.0, 3e4]))

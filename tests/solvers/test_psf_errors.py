@@ -8,6 +8,7 @@ from lnocl.core.scene.estimate import Estimate
 from lnocl.core.scene.scene import Scene
 from lnocl.core.scene.view import View, Window
 from lnocl.core.solvers.psf_errors import (
+    ALIKE,
     COMMON,
     N_SHAPES,
     N_SLOPES,
@@ -95,7 +96,7 @@ def test_changed_psfs_keep_their_light_and_those_alike_stay_so():
     psfs = [lopsided(3.5), lopsided(4.0), lopsided(3.5)]
     observation = lnocl.Observation(np.ones((3, 48, 48)), psfs, psf_centre="given", psf_error=ERROR)
     np.testing.assert_array_equal(alike(observation), [0, 1, 0])
-    theta = np.array([[0.5, 0.2, 0.4, 0.1, 0, 0, 0.3], np.zeros(N_SHAPES)])
+    theta = np.array([[0.5, 0.2, 0.4, 0.1, 0, 0.3], np.zeros(N_SHAPES)])
     found = with_errors(observation, theta).psfs
     np.testing.assert_allclose(found.sum(axis=(1, 2)), 1.0, rtol=1e-12)
     np.testing.assert_array_equal(found[0], found[2])
@@ -168,6 +169,14 @@ def test_zero_points_are_of_images_of_one_epoch_and_are_none_together():
     slopes, unknowns = errors.slopes(1, model)
     np.testing.assert_allclose(slopes[-1], ZERO_POINTS * 0.03 * (model - views[1].background))
     assert unknowns[-1] == N_SLOPES
+
+
+def test_theta_of_two_psfs_is_correlated_and_each_has_its_own_variance():
+    estimate = scene_of([lopsided(3.0), lopsided(3.5), lopsided(3.0)], psf_error=0.03)
+    views = [View(estimate.scene, j) for j in range(3)]
+    prior = PsfErrors(estimate, views, {}).prior[: 2 * N_SLOPES, : 2 * N_SLOPES]
+    expected = np.kron([[1.0, ALIKE], [ALIKE, 1.0]], np.eye(N_SLOPES))
+    np.testing.assert_allclose(np.linalg.inv(prior), expected, rtol=0, atol=1e-12)
 
 
 def test_light_beyond_a_file_is_an_unknown_where_images_are_larger():

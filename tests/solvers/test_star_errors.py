@@ -2,15 +2,28 @@
 
 import numpy as np
 import pytest
+from scipy.linalg import cho_factor, cho_solve
+from scipy.ndimage import gaussian_filter
 
 import lnocl
 from lnocl.core.scene.estimate import Estimate
 from lnocl.core.scene.forward_model import Model
 from lnocl.core.scene.scene import Scene
-from lnocl.core.scene.texture import Texture, resolution
+from lnocl.core.scene.smooth_field import SmoothField
+from lnocl.core.scene.texture import ROUND, Texture, resolution
 from lnocl.core.scene.view import View, Window
 from lnocl.core.solvers import least_squares, near_star
-from lnocl.core.solvers.star_errors import standard_errors
+from lnocl.core.solvers.near_star import CUSP, DEVIATION
+from lnocl.core.solvers.psf_errors import (
+    ALIKE,
+    COMMON,
+    CORRELATED,
+    PIXELS,
+    SMOOTHED,
+    ZERO_POINTS,
+    slopes_of,
+)
+from lnocl.core.solvers.star_errors import LEFT, standard_errors
 
 N = 32
 Y, X = np.indices((N, N), float)
@@ -32,6 +45,7 @@ KNOWN = {
     "map of read noise": {"read_noise": RNG.uniform(0.5, 3.0, (2, N, N)), "mask": MASK},
     "epochs": {"epochs": [0, 1], "mask": MASK},
     "map of exposures": {"exposure": RNG.uniform(0.5, 1.5, (2, N, N)), "read_noise": 2.0},
+    "doubted PSFs": {"psf_error": 0.03, "exposure": [1.0, 1.5]},
 }
 
 
@@ -53,10 +67,47 @@ def a_scene(stars=STARS, sky=SKY, psfs=PSFS, seed=0, **known):
     return scene, sky, fluxes
 
 
+def doubts(scene, sky, fluxes):
+    """Return what PSFs and cusps may change images by, each a standard deviation, (k, p, N, N).
+
+    Each image has a PSF of its own, and all are of one epoch.
+    """
+    observation, p = scene.observation, scene.n_images
+    psfs, error, columns = observation.psfs, observation.psf_error, []
+    images = np.eye(p)[:, :, None, None]
+
+    def light(psfs, fluxes=fluxes):
+        field = Scene(observation.replace(psfs=psfs), scene.places).star_field
+        return np.array([field.light(j, fluxes) for j in range(p)])
+
+    width, own = resolution(scene), light(psfs)
+    for s, (x, y) in enumerate(scene.places):
+        is_round = np.hypot(X - x, Y - y) <= ROUND * width
+        star = CUSP * sky[is_round].sum() * light(psfs, np.eye(len(fluxes))[s])
+        columns.append([gaussian_filter(each, width * DEVIATION, mode="wrap") for each in star])
+    slopes = np.array([slopes_of(psf, error) for psf in psfs])
+    root = np.linalg.cholesky((1.0 - ALIKE) * np.eye(p) + ALIKE)
+    changes = [light(psfs + each) - own for each in np.moveaxis(slopes, 1, 0)]
+    columns += [each[:, None, None] * change for each in root.T for change in changes]
+    root = np.linalg.cholesky(np.linalg.inv(np.eye(p) + COMMON**-2))
+    sources = Model(scene).images(sky, fluxes) - scene.background()[:, None, None]
+    columns += [ZERO_POINTS * error * each[:, None, None] * sources for each in root.T]
+    smooth = SmoothField((N, N), CORRELATED)
+    fields = np.array([smooth.apply(unit) for unit in np.eye(N * N).reshape(-1, N, N)])
+    scatter = PIXELS * error * light([gaussian_filter(psf, SMOOTHED) for psf in psfs])
+    for j, share, each in zip(
+        images, own / own.sum(axis=(1, 2), keepdims=True), scatter, strict=True
+    ):
+        change = each * fields
+        change = change - change.sum(axis=(1, 2), keepdims=True) * share
+        columns.extend(j * change[:, None])
+    return columns
+
+
 def dense(scene, sky, fluxes, moves):
     """Return the errors by explicit matrices, differences for the slopes of positions.
 
-    A star is at one place in all epochs.
+    A star is at one place in all epochs. What has a prior is in the covariance of the residuals.
     """
     model, texture = Model(scene), Texture(sky, scene.shown_stars, resolution(scene))
     weights = scene.scale * model.weights / np.maximum(model.images(sky, fluxes), 1e-12)
@@ -77,15 +128,17 @@ def dense(scene, sky, fluxes, moves):
     units = np.eye(N * N).reshape(-1, N, N)
     level = np.ones((len(weights), N, N)) * texture.mean.mean() * scene.gains[:, None, None]
     fields = [*(model.forward(texture.apply(unit)) for unit in units), level]
-    k = len(columns)
-    columns = np.array([*columns, *fields]).reshape(k + len(fields), -1)
-    prior = np.r_[np.zeros(k), np.ones(len(fields))]
-    information = (columns * weights.ravel()) @ columns.T + np.diag(prior)
+    fields += doubts(scene, sky, fluxes) if scene.observation.psf_error else []
+    roots = np.sqrt(weights).ravel()
+    columns, fields = (np.reshape(each, (len(each), -1)) * roots for each in (columns, fields))
     expected = model.images(texture.mean, fluxes)
-    left = (np.array(list(scene.images())) - expected) * weights
-    change = np.linalg.solve(information, columns @ left.ravel())[:k]
-    variances = np.diag(np.linalg.inv(information))[:k]
+    left = roots * (np.array(list(scene.images())) - expected).ravel()
+    covariance = np.eye(len(roots)) + fields.T @ fields
+    seen = cho_solve(cho_factor(covariance), columns.T)
+    variances = np.linalg.inv(columns @ seen)
+    change, variances = variances @ (left @ seen), np.diag(variances)
     of_fluxes, of_places = np.split(np.hypot(np.sqrt(variances), change), [n])
+    of_fluxes = np.hypot(of_fluxes, LEFT * scene.observation.psf_error * fluxes)
     of_places = of_places.reshape(-1, len(places)).T.repeat(scene.n_epochs, axis=0)
     return np.column_stack([of_fluxes, of_places])
 

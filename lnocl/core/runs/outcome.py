@@ -105,12 +105,15 @@ class Mended(NamedTuple):
         The weight of the edge-preserving term that the error of the PSFs asks for; None for 0.
     fits : bool
         Whether the PSFs were judged, and no error is left that noise does not explain.
+    is_within : bool
+        Whether they were judged, and are off by no more than their `psf_error` holds.
     """
 
     setup: Setup
     refinement: PsfRefinement | None = None
     near_stars: Array | None = None
     fits: bool = False
+    is_within: bool = False
 
 
 def mean_over_epochs(fluxes: Array, n_epochs: int) -> Array:

@@ -44,8 +44,8 @@ class Prepared:
         That of `lnocl.core.runs.steady`, where such a run goes first.
     refinement : PsfRefinement or None
         The outcome for PSFs that were judged.
-    fits : bool
-        Whether PSFs were judged, and fit.
+    is_within : bool
+        Whether PSFs were judged, and are off by no more than their `psf_error` holds.
     found : mapping of str
         What steps of the plan have found, in words.
     """
@@ -56,7 +56,7 @@ class Prepared:
     stop: StopName | float | None
     steady: Penalty | None = None
     refinement: PsfRefinement | None = None
-    fits: bool = False
+    is_within: bool = False
     found: Mapping[str, str] = field(default_factory=dict)
 
     def of(self, observation: Observation, stars: Array, **changes: Any) -> Prepared:
@@ -90,9 +90,10 @@ def prepare(plan: Plan, progress: bool = False) -> Prepared:
     penalties = _penalties(plan, mended, are_wrong)
     if are_wrong and stop == "held-out":  # which shares their error, and chooses too little
         stop = CONVERGED
-    steady, fits = steady_penalty(penalties), is_auto and mended.fits
+    steady, is_within = steady_penalty(penalties), is_auto and mended.is_within
     refinement = mended.refinement
-    return Prepared(mended.setup, penalties, plan.n_iter, stop, steady, refinement, fits, found)
+    of_psfs = steady, refinement, is_within
+    return Prepared(mended.setup, penalties, plan.n_iter, stop, *of_psfs, found)
 
 
 def _mend_images(plan: Plan) -> tuple[Setup, dict[str, str]]:

@@ -43,9 +43,10 @@ N_ITER = 300
 def settle_psfs(setup: Setup, penalty: Penalty, tick: Callable[[], object] = int) -> list[Array]:
     """Return steps of theta, shape (n_psfs, N_SHAPES) each, one after the other.
 
-    Shifts are left to the positions, and zero points as they are given. PSFs narrower than two of
-    their pixels are left, as their samples do not hold their shape. No step follows a run that
-    diverges.
+    Shifts are left to the positions, and zero points as they are given. So are wings: what is not
+    the extended source's is told from it by its smoothness alone, and each round would hand it more
+    of them. PSFs narrower than two of their pixels are left, as their samples do not hold their
+    shape. No step follows a run that diverges.
 
     Parameters
     ----------

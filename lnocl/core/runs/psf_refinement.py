@@ -44,6 +44,10 @@ CLEANED = 0.99
 # Free pixels, which may fit anything, are to leave less than this share of kappa. Where it is not
 # significant they are tried above this kappa.
 FITTED, FREED = 0.3, 0.1
+# What their `psf_error` holds of PSFs is an error of no more than so many times it.
+HELD = 2.0
+# Families that take a host, or a companion, for the PSF: unasked they are fitted beyond it alone.
+TAKING = "jitter", "pixels"
 # Rounds of a search: each takes so many steps, and judges the PSFs. It ends where a round lowers
 # the misfit by less than so many of its standard deviations.
 ROUNDS, STEPS, IMPROVED = 4, 2, 0.3
@@ -91,10 +95,11 @@ def mend(
     """Return a setup whose positions and PSFs are mended where the images ask for it.
 
     PSFs that may have an error become the mean of what the stars show of it
-    (`lnocl.core.runs.psf_posterior`), unless they fit worse so. Pixels, whose scatter is not known,
-    are not freed then where little is wrong: they take a host, or a companion, for the PSF.
+    (`lnocl.core.runs.psf_posterior`), unless they fit worse so. Where they are off by no more than
+    that error holds then, neither jitter nor pixels are fitted unasked, and stars take their
+    marginal fluxes.
 
-    What does not fit then is mended: stars are moved first, then the noise of PSFs is taken from
+    What does not fit is mended: stars are moved first, then the noise of PSFs is taken from
     their wings, the families are fitted, and pixels freed. Each is tried only where the misfit
     before is in doubt. It is taken where it leaves less than half of kappa, or nothing to doubt,
     and every star more than half its flux. Wings without noise are taken where they lower kappa.
@@ -127,9 +132,8 @@ def mend(
     if given.psfs is not psfs:
         psfs = given.psfs
         _tell_widths(observation, psfs)
-        is_wrong = given.misfit.kappa > FREED or len(observation.psf_scatter)
-        if not (is_asked or is_wrong):
-            names = [name for name in names if name != "pixels"]
+    if not is_asked and _is_held(given, observation):
+        names = [name for name in names if name not in TAKING]
     state = given
     if state.misfit.is_doubtful and moves == "auto":
         state = _move(runs, state)
@@ -162,7 +166,7 @@ def mend(
     near_stars = allowance.near_stars(setup.pad)
     if not (is_asked or len(known) or is_told):
         changed = replace(setup, observation=observation, refine_positions=state.moves)
-        return Mended(changed, None, near_stars, True)
+        return Mended(changed, None, near_stars, True, True)
     _tell(given, state, tried, done)
     refinement = PsfRefinement(
         tuple(families.parameters),
@@ -181,7 +185,15 @@ def mend(
     if not len(known) and len(scatter := allowance.scatter()):
         observation = observation.replace(psf_scatter=scatter)
     changed = replace(setup, observation=observation, refine_positions=state.moves)
-    return Mended(changed, refinement, near_stars, not allowance.error)
+    fits = not allowance.error
+    is_within = fits or _is_held(state, observation)
+    return Mended(changed, refinement, near_stars, fits, is_within)
+
+
+def _is_held(state: _State, observation: Observation) -> bool:
+    """Return whether PSFs that are not exact are off by no more than their `psf_error` holds."""
+    error = observation.psf_error
+    return bool(error) and state.misfit.kappa <= HELD * error
 
 
 def _of_stars(state: _State) -> Array:

@@ -6,9 +6,9 @@ Every real PSF K_j is a little wrong. What the images have is taken to be
 
 with the derivatives L of K_j (`slopes_of`), each times the standard deviation of its prior, light
 beyond its file among them (`lnocl.core.scene.psf_edge`), and the errors D_j of its pixels, in
-proportion to the PSF (`PixelErrors`). Images with the same PSF have
-the same theta. Where several images are of one epoch, each has a zero point besides: the light that
-it has of all sources, relative to the others.
+proportion to the PSF (`PixelErrors`). Images with the same PSF have the same theta, and those of
+two PSFs are correlated, as PSFs of one set err together. Where several images are of one epoch,
+each has a zero point besides: the light that it has of all sources, relative to the others.
 
 `lnocl.Observation` has the priors as `psf_error`, the standard deviation of the relative width.
 Light outside the stars is taken through the PSF as it is.
@@ -37,7 +37,7 @@ from lnocl.core.scene.view import View
 
 # The derivatives: by a stretch and a blur along x, across and along y each, by wings, by a shift,
 # by the light beyond the file.
-N_SLOPES, N_SHAPES = 10, 7
+N_SLOPES, N_SHAPES = 10, 6
 # Standard deviations over that of the width: of the errors of pixels, relative to the PSF smoothed,
 # of zero points, of a shift and of the width of the Lorentzian of wings, both in widths of the PSF.
 PIXELS, ZERO_POINTS, SHIFT, WINGS = 0.67, 0.67, 0.5, 0.3
@@ -46,10 +46,12 @@ PIXELS, ZERO_POINTS, SHIFT, WINGS = 0.67, 0.67, 0.5, 0.3
 CORRELATED, SMOOTHED = 0.6, 2.0
 # The variance of a Gaussian of unit full width at half maximum.
 VARIANCE = 1.0 / (8.0 * np.log(2.0))
-# By the PSF, the image, the shape of the window, and what is made.
-Made = dict[tuple[int, int, tuple[int, int], str], Sequence[Any]]
+# By the PSF, which is of one image, the shape of the window, and what is made.
+Made = dict[tuple[int, tuple[int, int], str], Sequence[Any]]
 # Pixels beside a PSF in which the derivatives of its edges ring.
 MARGIN = 8
+# The correlation of theta of two PSFs: those of a library err together, those of a frame alone.
+ALIKE = 0.5
 # The mean of the zero points of an epoch is known to this share of each: it is that of the fluxes.
 COMMON = 1e-3
 
@@ -155,7 +157,10 @@ class PsfErrors:
         self._is_one_of_several = np.bincount(epochs)[epochs] > 1
         self._zero_points = n - 1 + np.cumsum(self._is_one_of_several)
         self.n = n + int(self._is_one_of_several.sum())
+        n_psfs = count(observation)
+        among = np.linalg.inv((1.0 - ALIKE) * np.eye(n_psfs) + ALIKE)
         self.prior = np.eye(self.n)
+        self.prior[:n, :n] = np.kron(among, np.eye(N_SLOPES))
         for epoch in np.unique(epochs[self._is_one_of_several]):
             of_epoch = self._zero_points[epochs == epoch]
             self.prior[np.ix_(of_epoch, of_epoch)] += COMMON**-2
@@ -210,7 +215,7 @@ class PsfErrors:
         for s in field.reaching(j, view.window[:2], view.window.shape):
             if s < scene.n_stars:  # else it is a halo
                 psf = field.psfs[j][s]
-                key = id(psf), j, view.window.shape, name
+                key = id(psf), view.window.shape, name
                 if key not in self._made:
                     self._made[key] = psf.changed(make)
                 for image, each in zip(seen, self._made[key], strict=True):
