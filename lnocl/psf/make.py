@@ -268,7 +268,7 @@ def make_psf(
     background: 100, as given, subtracted
     bad pixels: 0 in the frame
     centre: x = 23.300, y = 18.800, FWHM 4.71 pixels; shifted by x -0.300, y 0.200
-    crop: 21 x 21 pixels; by its edge 0.00 % +- 0.00 % of its light is beyond
+    crop: 21 x 21 pixels; by its edge 0.01 +- 0.05 % of its light is beyond
     negative pixels: 0, 0.00 % of the flux; left as they are
     normalised: flux 125664 set to 1
     """

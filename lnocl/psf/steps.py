@@ -344,7 +344,7 @@ def crop_square(
     edge = psf_edge(psf)
     if edge.radius < LEAST_RADIUS:
         return psf, f"{line}; too few to tell the light beyond"
-    beyond = f"{_percent(edge.share)} +- {_percent(edge.light_error)}"
+    beyond = f"{100 * edge.share:.2f} +- {_percent(edge.light_error)}"
     return psf, f"{line}; by its edge {beyond} of its light is beyond"
 
 

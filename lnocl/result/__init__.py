@@ -79,7 +79,7 @@ class Result(Measured):
         The relative error of the extended source that held-out counts estimate, for each smoothing
         and iteration that they compared last. Empty where they did not choose.
     psf_refinement : PsfRefinement or None
-        The outcome for PSFs that were to be refined, or whose scatter was given
+        The outcome for PSFs that were to be refined, or are exact but for a scatter
         (`lnocl.core.runs.outcome.PsfRefinement`); None without either.
     halo_fluxes : ndarray of float64, shape (n_halos, p)
         The amounts of the observation's `halos` in each image: electrons on its good pixels, not

@@ -28,7 +28,7 @@ CURVE_DTYPE = np.dtype([("smoothing", np.float64), ("iteration", np.int64), ("er
 
 @dataclass(frozen=True)
 class PsfRefinement:
-    """The outcome for PSFs that do not fit, were to be refined, or whose scatter was given.
+    """The outcome for PSFs that do not fit, were to be refined, or are exact but for a scatter.
 
     Attributes
     ----------
@@ -43,8 +43,9 @@ class PsfRefinement:
     is_accepted : bool
         Whether the refined PSFs are used (`lnocl.core.runs.psf_refinement.mend`).
     psf_error : float
-        Relative error that the PSFs used still have at the stars, or as given by ``psf_scatter``; 0
-        where it is not told from noise. Where pixels were fitted it is the error before that.
+        Relative error that the PSFs used still have at the stars, or, where `psf_error` of the
+        observation is 0, as given by ``psf_scatter``; 0 where it is not told from noise. Where
+        pixels were fitted it is the error before that.
     edges : ndarray of float64, shape (k + 1,)
         Radii of rings round a star, pixels.
     errors_in_rings : ndarray of float64, shape (k,)
@@ -64,14 +65,15 @@ class PsfRefinement:
 
     Examples
     --------
-    One image of a star, whose PSF is known to 1 % in each pixel:
+    One image of a star, whose PSF is exact but for 1 % in each pixel:
 
     >>> import numpy as np
     >>> import lnocl
     >>> y, x = np.indices((33, 33)) - 16
     >>> psf = np.exp(-(x**2 + y**2) / 4)
     >>> psf /= psf.sum()
-    >>> observation = lnocl.Observation(5 + 1000 * psf, psf, psf_scatter=0.01 * psf)
+    >>> known = {"psf_scatter": 0.01 * psf, "psf_error": 0.0}
+    >>> observation = lnocl.Observation(5 + 1000 * psf, psf, **known)
     >>> result = lnocl.deconvolve(observation, [(16, 16)], stop=None, n_iter=5, engine="numpy")
     >>> result.psf_refinement.is_accepted
     False
