@@ -51,7 +51,7 @@ def point_flux(
     without = Texture(estimate.sky, there, width).mean
     fluxes = np.insert(estimate.star_fluxes, n, [max(flux, 0.0)] * n_epochs)
     other = Estimate(scene.with_star(place), without, fluxes)
-    near = NearStar(Surroundings(other, moves, raised, holds_psfs=True), n, FINISHED)
+    near = NearStar(Surroundings(other, moves, raised, holds_shapes=True), n, FINISHED)
     at = np.array([np.flatnonzero(near.held == s)[0] for s in range(n, n + n_epochs)])
     at = at[np.isfinite(variances(near.fit.information)[at])]
     if not len(at):

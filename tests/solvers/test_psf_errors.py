@@ -100,13 +100,31 @@ def test_changed_psfs_keep_their_light_and_those_alike_stay_so():
     found = with_errors(observation, theta).psfs
     np.testing.assert_allclose(found.sum(axis=(1, 2)), 1.0, rtol=1e-12)
     np.testing.assert_array_equal(found[0], found[2])
-    np.testing.assert_allclose(found[1], observation.psfs[1], rtol=1e-12)
+    np.testing.assert_allclose(found[1], observation.psfs[1], rtol=0, atol=1e-15)
+    theta[0, 3:] = 0.0
+    found = with_errors(observation, theta).psfs
     expected = psfs[0] + np.tensordot(theta[0], slopes_of(psfs[0], ERROR)[:N_SHAPES], 1)
     assert abs(expected - psfs[0]).max() > 0.03 * psfs[0].max()
     np.testing.assert_allclose(found[0], expected, rtol=0, atol=1e-4 * psfs[0].max())
     narrow = with_errors(observation, -20.0 * theta).psfs[0]
     assert narrow.min() == 0.0
     assert narrow.sum() == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("blur", [4.0, -3.0])
+def test_blurs_are_convolutions_with_a_gaussian_and_back(blur):
+    y, x = np.indices((49, 49)) - 24
+    variance = (3.5 / 2.3548) ** 2
+    added = 2 * ERROR * variance * blur
+    psf, expected = (
+        np.exp(-(x**2) / (2 * along) - y**2 / (2 * variance)) / np.sqrt(along * variance)
+        for along in (variance, variance + added)
+    )
+    observation = lnocl.Observation(np.ones((1, 64, 64)), psf, psf_error=ERROR)
+    found = with_errors(observation, np.array([[0, 0, 0, blur, 0, 0]])).psfs[0]
+    expected *= found.sum() / expected.sum()
+    assert abs(expected - psf / psf.sum()).max() > 0.05 * expected.max()
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-3 * expected.max())
 
 
 def scene_of(psfs, **known):

@@ -8,8 +8,9 @@ step of Newton to where the least squares of `lnocl.core.solvers.near_star` have
 
 in which the extended source is expected to go on under the star as it falls round it
 (`lnocl.core.scene.texture`). It takes the light that the same step gives it in the core of the
-star, but no more than the star has lost or won. PSFs are held: what they may have wrong is in the
-errors of stars (`lnocl.core.solvers.star_errors`), with what it would move their fluxes by.
+star, but no more than the star has lost or won. Of what PSFs may have wrong their pixels are free.
+Their shapes are held, as they are fitted before (`lnocl.core.runs.psf_posterior`): the errors of
+stars (`lnocl.core.solvers.star_errors`) have these, with what they would move fluxes by.
 """
 
 from __future__ import annotations
@@ -42,7 +43,7 @@ def marginal(estimate: Estimate) -> Estimate:
         That after the step. A star without light, or that the images do not determine, stays.
     """
     scene, star_fluxes = estimate.scene, estimate.star_fluxes
-    around = Surroundings(estimate, False, holds_psfs=True)
+    around = Surroundings(estimate, False, holds_shapes=True)
     after, fluxes = estimate.sky.copy(), star_fluxes.copy()
     n_epochs = scene.observation.n_epochs
     for first in range(0, scene.n_stars, n_epochs):

@@ -66,6 +66,8 @@ class Surroundings:
     raised : ndarray of float64, shape (n_shapes,), optional
         How many times the variance of each halo is that with the extended source known
         (`lnocl.core.solvers.halos.HaloErrors`). Halos are unknown then; by default they are known.
+    holds_shapes : bool
+        Whether only the pixels of PSFs are unknown, of what those may have wrong.
 
     Attributes
     ----------
@@ -84,9 +86,9 @@ class Surroundings:
         estimate: Estimate,
         moves: bool,
         raised: Array | None = None,
-        holds_psfs: bool = False,
+        holds_shapes: bool = False,
     ) -> None:
-        self.estimate, self.moves, self.holds_psfs = estimate, moves, holds_psfs
+        self.estimate, self.moves, self.holds_shapes = estimate, moves, holds_shapes
         self.scene = scene = estimate.scene
         self.made: Made = {}
         self.width = resolution(scene)
@@ -140,7 +142,7 @@ class NearStar:
     unknowns : ndarray of int, shape (n_held, 1 or 3)
         Those of each: its flux, and perhaps x and y, which it has in all epochs.
     n : int
-        All of these, and the cusps; those of `psfs` follow.
+        All of these, and the cusps; those of `psfs` follow, unless they are held.
     psfs : PsfErrors or None
         The errors of the PSFs there; None where they are exact.
     images : list of LinearImage
@@ -174,10 +176,10 @@ class NearStar:
         beyond = self.source.images_of(self.expected)
         observation = scene.observation
         self.psfs, self._cusps = None, list[float]()
-        error = 0.0 if around.holds_psfs else observation.psf_error
-        if error or (len(observation.psf_scatter) and not around.holds_psfs):
+        is_free = not around.holds_shapes
+        if observation.psf_error or (len(observation.psf_scatter) and is_free):
             self.psfs = PsfErrors(around.estimate, self._views, around.made)
-        if error:
+        if observation.psf_error:
             self._cusps = [self._cusp(around, s) for s in self.held]
         self.images = [
             self._linearise(around, sources, *each)
@@ -185,7 +187,7 @@ class NearStar:
         ]
         self.n = sources.n + len(self._cusps)
         prior = [self._prior_of_halos(around, sources.n), np.eye(len(self._cusps))]
-        self.prior = block_diag(*prior, *([self.psfs.prior] if self.psfs else []))
+        self.prior = block_diag(*prior, *([self.psfs.prior] if self.psfs and is_free else []))
 
     def _cusp(self, around: Surroundings, star: int) -> float:
         """Return the standard deviation of the light of a cusp under a star."""
@@ -275,7 +277,7 @@ class NearStar:
             cusp = scene.star_cutout(view.j, s).blurred(width * DEVIATION, scene.image_grid)
             cusps.append(light * view.cut(cusp))
         image = image.beside(cusps, sources.n + np.arange(len(cusps)))
-        if self.psfs:
+        if self.psfs and not around.holds_shapes:
             of_psfs, unknowns = self.psfs.slopes(view.j, model)
             image = image.beside(of_psfs, sources.n + len(cusps) + unknowns)
         n, shape = len(image.unknowns), self.window.shape

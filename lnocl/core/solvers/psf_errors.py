@@ -78,24 +78,32 @@ def slopes_of(psf: Array, error: float) -> Array:
         By a stretch along x, across and along y, by a blur likewise, by wings, and by a shift along
         x and y.
     """
+    spectrum, stretches, blurs, (v, u) = _spectra(psf, error)
     width = fwhm(psf)
-    wide = np.pad(psf, MARGIN)
-    y, x = (np.arange(n) - n // 2 for n in wide.shape)
-    v, u = (2.0 * np.pi * f for f in (np.fft.fftfreq(len(y))[:, None], np.fft.rfftfreq(len(x))))
-    spectrum = scipy.fft.rfft2(wide)
-    along, across = error * scipy.fft.rfft2(np.array([x * wide, y[:, None] * wide]))
-    blur = -error * VARIANCE * width**2 * spectrum
     shift = -1j * SHIFT * error * width * spectrum
-    spectra = [
-        *(-1j * u * along, -1j * (u * across + v * along), -1j * v * across),
-        *(u**2 * blur, 2.0 * u * v * blur, v**2 * blur),
-        -WINGS * error * width * np.hypot(u, v) * spectrum,
-        *(u * shift, v * shift),
-    ]
-    changes = scipy.fft.irfft2(np.array(spectra), wide.shape)
-    changes = changes[:, MARGIN:-MARGIN, MARGIN:-MARGIN]
+    wings = -WINGS * error * width * np.hypot(u, v) * spectrum
+    changes = _from_spectra([*stretches, *(blurs * spectrum), wings, u * shift, v * shift], psf)
     won = changes.sum(axis=(1, 2), keepdims=True) / psf.sum()
     return np.asarray(changes - won * psf)
+
+
+def _spectra(psf: Array, error: float) -> tuple[Array, Array, Array, tuple[Array, Array]]:
+    """Return the spectrum of a PSF, its changes by stretches, factors of blurs, and v and u."""
+    wide = np.pad(psf, MARGIN)
+    y, x = (np.arange(n) - n // 2 for n in wide.shape)
+    v, u = 2.0 * np.pi * np.fft.fftfreq(len(y))[:, None], 2.0 * np.pi * np.fft.rfftfreq(len(x))
+    along, across = error * scipy.fft.rfft2(np.array([x * wide, y[:, None] * wide]))
+    stretches = np.array([-1j * u * along, -1j * (u * across + v * along), -1j * v * across])
+    squares = np.array(np.broadcast_arrays(u**2, 2.0 * u * v, v**2))
+    blurs = -error * VARIANCE * fwhm(psf) ** 2 * squares
+    return np.asarray(scipy.fft.rfft2(wide)), stretches, blurs, (np.asarray(v), np.asarray(u))
+
+
+def _from_spectra(spectra: Sequence[Array], psf: Array) -> Array:
+    """Return arrays of the shape of a PSF from spectra of `_spectra`."""
+    shape = tuple(n + 2 * MARGIN for n in psf.shape)
+    wide = scipy.fft.irfft2(np.array(spectra), shape)
+    return np.asarray(wide[:, MARGIN:-MARGIN, MARGIN:-MARGIN])
 
 
 def alike(observation: Observation) -> NDArray[np.int_]:
@@ -113,15 +121,19 @@ def count(observation: Observation) -> int:
 def with_errors(observation: Observation, theta: Array) -> Observation:
     """Return an observation whose PSFs have changes of shape, shape (n_psfs, N_SHAPES).
 
-    They keep their light and their places. What the linear change would have below 0 is 0.
+    Blurs are convolutions, as `slopes_of` has them to first order alone. PSFs keep their light and
+    their places. What would be below 0 is 0.
     """
     numbers, error = alike(observation), observation.psf_error
 
     def change(j: int, stack: Array) -> Array:
+        by_stretch, by_blur = theta[numbers[j]].reshape(2, 3)
         changed = stack.copy()
         for k, psf in enumerate(stack):
-            slopes = slopes_of(psf, error)[:N_SHAPES]
-            changed[k] += np.tensordot(theta[numbers[j]], slopes, axes=1)
+            spectrum, stretches, blurs, _ = _spectra(psf, error)
+            spectrum = spectrum + np.tensordot(by_stretch, stretches, axes=1)
+            blurred = spectrum * np.exp(np.tensordot(by_blur, blurs, axes=1))
+            [changed[k]] = _from_spectra([blurred], psf)
         changed = np.where(stack < 0, changed, changed.clip(0.0))
         light = stack.sum(axis=(1, 2), keepdims=True)
         return changed * light / changed.sum(axis=(1, 2), keepdims=True)
