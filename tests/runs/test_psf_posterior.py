@@ -197,3 +197,20 @@ def test_a_star_with_a_psf_of_its_own_tells_nothing_of_the_others(monkeypatch):
     own = {"star_places": [STAR], "star_psfs": psf(TRUE[0] / 1.1)}
     [step] = settle(observe(TRUE[:1], TRUE[:1], exposure=DEPTHS[:1], psf_error=0.03, **own))
     assert not step.any()
+
+
+@pytest.mark.filterwarnings("ignore:the PSFs do not fit")
+@pytest.mark.parametrize(("error", "is_within"), [(0.02, False), (0.05, True)])
+def test_jitter_and_pixels_are_fitted_and_fluxes_not_marginal_beyond_what_is_held(error, is_within):
+    """PSFs with three lobes that those of the images lack: off by 8 %."""
+    kernel = psf(TRUE[0])
+    y, x = np.indices(kernel.shape) - 20
+    r = np.hypot(x, y)
+    lobed = kernel * (1 + 0.35 * np.cos(3 * np.arctan2(y, x)) * r / (r + 3))
+    observation = observe(TRUE[:1], TRUE[:1], exposure=[1.0], psf_error=error)
+    observation = observation.replace(psfs=lobed / lobed.sum())
+    found = mend(setup_of(observation), ("jitter", "pixels"), "auto", False)
+    assert found.is_within == is_within
+    assert not found.fits
+    assert 0.06 < found.refinement.psf_error < 0.09
+    assert bool(found.refinement.parameters) != is_within

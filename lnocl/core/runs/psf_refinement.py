@@ -132,7 +132,7 @@ def mend(
     if given.psfs is not psfs:
         psfs = given.psfs
         _tell_widths(observation, psfs)
-    if not is_asked and _is_held(given, observation):
+    if not is_asked and _is_held(given.misfit, observation):
         names = [name for name in names if name not in TAKING]
     state = given
     if state.misfit.is_doubtful and moves == "auto":
@@ -186,14 +186,14 @@ def mend(
         observation = observation.replace(psf_scatter=scatter)
     changed = replace(setup, observation=observation, refine_positions=state.moves)
     fits = not allowance.error
-    is_within = fits or _is_held(state, observation)
+    is_within = fits or _is_held(estimate.misfit, observation)
     return Mended(changed, refinement, near_stars, fits, is_within)
 
 
-def _is_held(state: _State, observation: Observation) -> bool:
+def _is_held(misfit: PsfMisfit, observation: Observation) -> bool:
     """Return whether PSFs that are not exact are off by no more than their `psf_error` holds."""
     error = observation.psf_error
-    return bool(error) and state.misfit.kappa <= HELD * error
+    return bool(error) and misfit.kappa <= HELD * error
 
 
 def _of_stars(state: _State) -> Array:
