@@ -128,7 +128,7 @@ def test_wrong_psfs_have_three_times_the_weight_and_no_held_out_counts(monkeypat
     (penalty,) = prepared.penalties
     assert penalty.smoothing == 3.0 * recommend_smoothing(observe())
     assert penalty.near_stars is wrong
-    assert (prepared.stop, prepared.steady, prepared.fits) == (1e-6, None, False)
+    assert (prepared.stop, prepared.steady, prepared.is_within) == (1e-6, None, False)
 
 
 def test_a_wrong_word_is_refused_before_any_work():
