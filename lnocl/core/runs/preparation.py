@@ -112,12 +112,21 @@ def _mend_images(plan: Plan) -> tuple[Setup, dict[str, str]]:
 
 
 def _judge_psfs(plan: Plan, setup: Setup, progress: bool) -> Mended:
-    """Return that of `lnocl.core.runs.psf_refinement.mend`, or `setup` where it is not finite."""
-    from lnocl.core.runs.psf_refinement import mend  # which loads scipy
+    """Return that of `lnocl.core.runs.psf_refinement.mend`, or `setup` where it is not finite.
+
+    Points beside the stars, which PSFs that may have an error would follow, are held meanwhile.
+    """
+    from lnocl.core.runs.companions import beside_stars  # which loads scipy
+    from lnocl.core.runs.psf_refinement import MOST_STARS, mend
 
     judging = Progress(None, "it", bool(progress), "judging the PSFs", stays=False)
     with judging, suppress(NotFiniteError):  # of which the run itself tells
-        return mend(setup, plan.families, plan.moves, plan.is_asked, judging.update)
+        held = setup
+        if plan.families and setup.observation.psf_error and len(setup.stars) <= MOST_STARS:
+            points = beside_stars(setup, judging.update)
+            held = replace(setup, stars=np.concatenate([setup.stars, points]))
+        mended = mend(held, plan.families, plan.moves, plan.is_asked, judging.update)
+        return mended._replace(setup=replace(mended.setup, stars=setup.stars))
     return Mended(setup)
 
 
