@@ -389,13 +389,14 @@ def without_scatter(psfs):
     return getattr(psfs, "psf", psfs)
 
 
-def measure(line, seed, scatter=True, **options):
+def measure(line, seed, scatter=True, **known):
     """Print a run, and yield a row for each flux."""
     scene = LINES[line](np.random.default_rng([seed, zlib.crc32(line.encode())]))
+    scene = scene._replace(known=scene.known | known)
     if not scatter:
         scene = scene._replace(psfs=without_scatter(scene.psfs))
     begun = time.perf_counter()
-    _, found, errors, light, light_error, kappa, told = run(scene, **options)
+    _, found, errors, light, light_error, kappa, told = run(scene)
     seconds = time.perf_counter() - begun
     fluxes = np.ravel(scene.fluxes).astype(float)[scene.of_interest]
     found, errors = found[scene.of_interest], errors[scene.of_interest]
@@ -457,7 +458,7 @@ def summarise(table):
 
 
 def options_of(given):
-    """Return the options of `lnocl.deconvolve` that are given; older versions have none."""
+    """Return what of `lnocl.Observation` is given; older versions have none of it."""
     return {} if given.psf_error is None else {"psf_error": given.psf_error}
 
 
@@ -468,7 +469,7 @@ def main():
     )
     parser.add_argument("lines", nargs="*", metavar="LINE", help=", ".join(LINES))
     parser.add_argument("--seeds", type=int, nargs=2, default=(0, 4), metavar=("FIRST", "LAST"))
-    parser.add_argument("--psf-error", type=float, help="that of deconvolve, which has to have it")
+    parser.add_argument("--psf-error", type=float, help="that of Observation, which has to have it")
     parser.add_argument("--no-scatter", action="store_true", help="that of PSFs made is not given")
     parser.add_argument("--output", metavar="FILE.ecsv")
     given = parser.parse_args()

@@ -29,6 +29,7 @@ from lnocl.core.scene.psf_families import Family
 from lnocl.core.solvers import SolverName
 from lnocl.errors import note
 from lnocl.reconstruction import reconstruct
+from lnocl.residuals import judge_stars
 from lnocl.result import Callback, Result, make_result
 from lnocl.result.verdict import warn_of_faults
 
@@ -403,7 +404,7 @@ def _finish(outcome: Outcome, plan: Plan, prepared: Prepared, progress: bool) ->
     """Return an outcome with what the plan has marginal, and how well PSFs fit."""
     is_within = prepared.is_within
     if plan.does(STARS) and not plan.does(PSFS):  # as all stars have PSFs of their own
-        is_within = not any(star.is_misfit for star in outcome.star_residuals())
+        is_within = not any(star.is_misfit for star in judge_stars(outcome.estimate))
     if prepared.stop == "held-out" and outcome.stop_reason not in ("held-out", "callback"):
         is_within = False  # what leaves them without an end leaves marginal fluxes without sense
     has_halos, has_levels = plan.does(HALOS), plan.does(LEVELS)

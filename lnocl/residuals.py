@@ -22,6 +22,8 @@ CORE, WINGS = 0.5, 1e-3
 # (docs/validation/psf.md).
 REACH, SECTORS = 12.0, 8
 MUCH_HALO, MUCH_SHARE = 0.1, 0.05
+# So is light that a star may exchange with a host (docs/validation/psf_error.md).
+MUCH_EXCHANGED = MUCH_HALO
 # A misfit is this many times the noise, and as many standard errors above it.
 MISFIT, SIGNIFICANCE = 1.5, 5.0
 # Sides of the squares, pixels, in which the light of a sharp source is compared; the share that the
@@ -121,6 +123,10 @@ class StarResiduals(NamedTuple):
         wings, leaves such light there.
     halo_share : float
         The same light as a share of all that lies round the star.
+    exchanged : float
+        The share of the star's flux that it may exchange with an extended source that is brightest
+        under it, two standard errors (`lnocl.core.solvers.exchange`). It is 0 where that is not
+        most of the error, or where PSFs are exact.
 
     See Also
     --------
@@ -138,6 +144,7 @@ class StarResiduals(NamedTuple):
     wings: Fit
     halo: float
     halo_share: float
+    exchanged: float = 0.0
 
     @property
     def is_misfit(self) -> bool:
@@ -151,6 +158,11 @@ class StarResiduals(NamedTuple):
         It is more than a tenth of the star's flux, and more than 5 % of all light round it.
         """
         return self.halo > MUCH_HALO and self.halo_share > MUCH_SHARE
+
+    @property
+    def is_like_host(self) -> bool:
+        """Whether the star may exchange more than a tenth of its flux with a host."""
+        return self.exchanged > MUCH_EXCHANGED
 
 
 def sharp_sources(sky: Array, background: float, finer: int = 1) -> Array:

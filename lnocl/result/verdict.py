@@ -48,9 +48,10 @@ def faults(result: Result) -> list[str]:
     """Return where the model does not fit and what to do, a line each; parameters by their names.
 
     They are those of stars without light, of stars that moved too far, and of residuals far from
-    what noise leaves; and light all round a star, as a PSF that is too narrow leaves it.
+    what noise leaves; light all round a star, as a PSF that is too narrow leaves it; and light that
+    star and host may exchange.
     """
-    unfitted, lit, dark, lost = _Told(), _Told(), _Told(), _Told()
+    unfitted, lit, dark, lost, paired = (_Told() for _ in range(5))
     findings, at_stars, overall = result._findings, result.star_residuals(), result.fit()
     n_epochs = findings.observation.n_epochs
     for s, (place, given, flux, found) in enumerate(
@@ -73,6 +74,8 @@ def faults(result: Result) -> list[str]:
             unfitted.add(star, f"{in_words(place)}{then}")
         if found.has_halo:
             lit.add(star, f"{in_words(place)}{then}, {100 * found.halo:.0f} %")
+        if found.is_like_host:
+            paired.add(star, f"{in_words(place)}{then}, {100 * found.exchanged:.0f} %")
     lines = []
     if dark:
         lines.append(f"no light is left for {dark.count()}: {dark.words('; ')}")
@@ -108,6 +111,12 @@ def faults(result: Result) -> list[str]:
             f"light lies all round {lit.count()}, as a share of its flux: {lit.words('; ')}: the "
             "PSF is too narrow or lacks its wings, the background is too low, or a source lies "
             "there"
+        )
+    if paired:
+        lines.append(
+            f"{paired.count()} may exchange light with the extended source there, up to this share "
+            f"of the star's: {paired.words('; ')}: a sharper image tells them apart, or a PSF that "
+            "is known to be exact (`psf_error` 0 with a `smoothing`)"
         )
     return lines
 

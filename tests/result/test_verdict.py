@@ -108,7 +108,7 @@ def test_a_star_that_moved_as_far_as_stars_may_is_named_first(nameless):
 
 
 def test_a_star_counts_once_and_its_epochs_are_named(nameless):
-    bad = StarResiduals(Fit(100, 900.0, 200.0), Fit(), 0.2, 0.8)
+    bad = StarResiduals(Fit(100, 900.0, 200.0), Fit(), 0.2, 0.8, 0.176)
     places = np.repeat([(10.0, 13.0), (20.0, 9.0)], 2, axis=0)
     findings = SimpleNamespace(
         given_positions=places,
@@ -119,10 +119,14 @@ def test_a_star_counts_once_and_its_epochs_are_named(nameless):
         star_positions=places, star_fluxes=np.array([5.0, np.nan, 6.0, 7.0]), psf_refinement=None,
         smoothing=0.0, star_residuals=lambda: [bad] * 4, fit=Fit, _findings=findings,
     )  # fmt: skip
-    unfitted, lit = faults(result)
+    unfitted, lit, paired = faults(result)
     places = "(10, 13) in epoch 0 (20, 9) in epoch 0 (20, 9) in epoch 1"
     assert unfitted == f"the model does not fit at 2 of 2 stars, {places}: give a better PSF"
     assert lit.startswith("light lies all round 2 stars, as a share of its flux: (10, 13) in epoch")
+    assert paired.startswith(
+        "2 stars may exchange light with the extended source there, up to this"
+    )
+    assert "(10, 13) in epoch 0, 18 %; (20, 9) in epoch 0, 18 %; (20, 9) in epoch 1, 18 %" in paired
 
 
 @pytest.mark.parametrize("more", [[], ["--quiet"]])
@@ -148,6 +152,26 @@ def test_the_shell_says_each_fault_once(more, tmp_path, monkeypatch, capsys):
         assert f"lnocl: warning: {shown}" in said.err.splitlines()
         assert kept.count(f"warning: {shown}") == 1
     assert "the model fits" not in said.out
+
+
+@pytest.mark.parametrize("error", [0.03, 0.0])
+def test_a_host_is_named_that_may_exchange_light_with_the_star(error):
+    u, v = X - N // 2, Y - N // 2
+    psf = np.exp(-0.5 * ((u / 2.2) ** 2 + (v / 1.7) ** 2)) + 0.2 * np.exp(-0.1 * (u**2 + v**2))
+    host = np.exp(-np.hypot(X - STAR[0], 1.3 * (Y - STAR[1])) / 3)
+    laid = np.roll(psf / psf.sum(), (STAR[1] - N // 2, STAR[0] - N // 2), (0, 1))
+    spectra = np.fft.rfft2(host / host.sum()), np.fft.rfft2(np.fft.ifftshift(psf / psf.sum()))
+    means = LEVEL + 1e5 * laid + 1e5 * np.fft.irfft2(spectra[0] * spectra[1], (N, N))
+    image = np.random.default_rng(1).poisson(means.clip(0))
+    known = {"background": LEVEL, "psf_centre": "given", "psf_error": error}
+    observation = lnocl.Observation(image, psf, **known)
+    options = {**RUN, "n_iter": 100, "smoothing": 1e-3, "stop": None}
+    with warnings.catch_warnings(record=True) as warned:
+        warnings.simplefilter("always")
+        result = lnocl.deconvolve(observation, [STAR], **options)
+    is_named = [line.startswith("1 star may exchange light with") for line in result.verdict()]
+    assert sum(is_named) == (error > 0)
+    assert sum("exchange light" in str(each.message) for each in warned) == (error > 0)
 
 
 def test_tiles_have_a_verdict_too():

@@ -178,7 +178,8 @@ def test_a_window_and_what_lies_beyond_it_are_the_grid(monkeypatch, moves):
     monkeypatch.setattr(near_star, "WINDOW", 4.0)
     scene, sky, fluxes, _ = an_estimate(sky=0.05 * SKY)
     found = standard_errors(Estimate(scene, sky, fluxes), moves)
-    assert near_star._window_round(scene, STARS[0], resolution(scene)) != (N, N)
+    around = near_star.Surroundings(Estimate(scene, sky, fluxes), moves)
+    assert near_star.window_round(around, 0)[0].shape != (N, N)
     monkeypatch.setattr(near_star, "WINDOW", 1000.0)
     whole = standard_errors(Estimate(scene, sky, fluxes), moves)
     k = 3 if moves else 1

@@ -17,7 +17,7 @@ from lnocl.core.scene.observation import Observation
 from lnocl.core.scene.scene import Scene
 from lnocl.core.scene.stars import MAX_SHIFT
 from lnocl.errors import warn
-from lnocl.residuals import StarResiduals, judge_stars
+from lnocl.residuals import MUCH_EXCHANGED, StarResiduals, judge_stars
 
 if TYPE_CHECKING:
     from lnocl.core.solvers.levels import Levels
@@ -272,8 +272,12 @@ class Outcome:
             yield self.scene.in_electrons(image, j)[:ny, :nx]
 
     def star_residuals(self) -> list[StarResiduals]:
-        """Return how well the model fits at each star."""
-        return judge_stars(self.estimate)
+        """Return how well the model fits at each star, and what it may exchange with a host."""
+        from lnocl.core.solvers.exchange import exchanged  # which loads scipy
+
+        shares = exchanged(self.estimate, MUCH_EXCHANGED).tolist()
+        pairs = zip(judge_stars(self.estimate), shares, strict=True)
+        return [each._replace(exchanged=share) for each, share in pairs]
 
     def extended_flux(self, star_flux_errors: Array) -> tuple[float, float]:
         """Return the light of the extended source and its standard error, electrons."""

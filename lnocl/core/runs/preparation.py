@@ -114,18 +114,24 @@ def _mend_images(plan: Plan) -> tuple[Setup, dict[str, str]]:
 def _judge_psfs(plan: Plan, setup: Setup, progress: bool) -> Mended:
     """Return that of `lnocl.core.runs.psf_refinement.mend`, or `setup` where it is not finite.
 
-    Where PSFs may have an error, their scatter is one of the unknowns at the stars: PSFs fit unless
-    residuals show otherwise. Exact ones are wrong by the scatter that is given.
+    Points beside the stars, which PSFs that may have an error would follow, are held meanwhile.
+    The scatter of such PSFs is one of the unknowns at the stars: they fit unless residuals show
+    otherwise. Exact ones are wrong by the scatter that is given.
     """
-    from lnocl.core.runs.psf_refinement import mend  # which loads scipy
+    from lnocl.core.runs.companions import beside_stars  # which loads scipy
+    from lnocl.core.runs.psf_refinement import MOST_STARS, mend
 
     known, judged = setup.observation.psf_scatter, setup
     if setup.observation.psf_error and len(known):
         judged = replace(setup, observation=setup.observation.replace(psf_scatter=None))
-    mended = Mended(judged)
+    mended, held = Mended(judged), judged
     judging = Progress(None, "it", bool(progress), "judging the PSFs", stays=False)
     with judging, suppress(NotFiniteError):  # of which the run itself tells
-        mended = mend(judged, plan.families, plan.moves, plan.is_asked, judging.update)
+        if plan.families and setup.observation.psf_error and len(setup.stars) <= MOST_STARS:
+            points = beside_stars(setup, judging.update)
+            held = replace(judged, stars=np.concatenate([setup.stars, points]))
+        mended = mend(held, plan.families, plan.moves, plan.is_asked, judging.update)
+        mended = mended._replace(setup=replace(mended.setup, stars=setup.stars))
     if judged is setup:
         return mended
     observation = mended.setup.observation

@@ -18,12 +18,10 @@ from __future__ import annotations
 import numpy as np
 
 from lnocl.core.scene.arrays import Array
-from lnocl.core.scene.detector import on_sky
 from lnocl.core.scene.estimate import Estimate
-from lnocl.core.scene.scene import Scene
 from lnocl.core.scene.texture import core
 from lnocl.core.solvers.fluxes import variances
-from lnocl.core.solvers.near_star import NearStar, Surroundings
+from lnocl.core.solvers.near_star import NearStar, Surroundings, offsets_from
 
 # The share of the gradient at which conjugate gradients end.
 FINISHED = 1e-4
@@ -60,25 +58,13 @@ def marginal(estimate: Estimate) -> Estimate:
         moved = np.maximum(star_fluxes[star] + change[at] * scene.unit, 0.0)
         fluxes[star] = np.where(is_free, moved, star_fluxes[star])
         there = near.places(scene)
-        light = _core_of(near, scene, first) * (near.expected + near.source.of(x)) * scene.unit
+        away = np.hypot(*offsets_from(scene, first, near.window))
+        of_core = core(np.maximum(away - near.hidden, 0.0) / near.resolution)
+        light = of_core * (near.expected + near.source.of(x)) * scene.unit
         light = np.maximum(light, -after[there])
         lost = float((star_fluxes[star] - fluxes[star]).mean()) * scene.share_shown(first)
         after[there] += _at_most(light, lost)
     return estimate.changed(after, fluxes)
-
-
-def _core_of(near: NearStar, scene: Scene, star: int) -> Array:
-    """Return the core of a star in its window, 1 in its middle and where nothing is observed."""
-    window, (x, y) = (
-        near.window.finer(scene.oversample),
-        on_sky(scene.stars, scene.oversample)[star],
-    )
-    rows, columns = (
-        first + np.arange(k) - at
-        for first, k, at in zip((window.y, window.x), window.shape, (y, x), strict=True)
-    )
-    beyond = np.maximum(np.hypot(rows[:, None], columns) - near.hidden, 0.0)
-    return core(beyond / near.resolution)
 
 
 def _at_most(light: Array, total: float) -> Array:

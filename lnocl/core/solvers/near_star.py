@@ -50,6 +50,8 @@ MARGIN = 3.0
 CUSP = 1.5
 # The standard deviation of a Gaussian of unit full width at half maximum.
 DEVIATION = VARIANCE**0.5
+# The inverse variance of what is held.
+HELD = 1e12
 # Steps of conjugate gradients at most.
 N_STEPS = 2000
 
@@ -161,8 +163,7 @@ class NearStar:
 
     def __init__(self, around: Surroundings, star: int, finished: float) -> None:
         scene, width = around.scene, around.width
-        self.hidden = hidden_radius(scene, scene.stars[star], width)
-        self.window = _window_round(scene, scene.stars[star], WINDOW * width + 2.0 * self.hidden)
+        self.window, self.hidden = window_round(around, star)
         self._views = [View.round(scene, j, self.window) for j in range(scene.n_images)]
         self.held = np.append(star, _neighbours(scene, star, width))
         halos = scene.n_stars + np.arange(around.n_shapes * scene.n_images)
@@ -191,14 +192,9 @@ class NearStar:
 
     def _cusp(self, around: Surroundings, star: int) -> float:
         """Return the standard deviation of the light of a cusp under a star."""
-        scene, window = around.scene, self.window.finer(around.scene.oversample)
-        at = on_sky(scene.stars[star], scene.oversample)[::-1]
-        rows, columns = (
-            (first + np.arange(k) - place + n / 2) % n - n / 2
-            for first, k, place, n in zip(window[:2], window.shape, at, scene.grid, strict=True)
-        )
-        is_round = np.hypot(rows[:, None], columns) - self.hidden <= ROUND * self.resolution
-        return CUSP * float(around.estimate.part(self.places(scene))[is_round].sum())
+        distance = np.hypot(*offsets_from(around.scene, star, self.window))
+        is_round = distance - self.hidden <= ROUND * self.resolution
+        return CUSP * float(around.estimate.part(self.places(around.scene))[is_round].sum())
 
     def _responses(self, around: Surroundings) -> Array:
         """Return what a flat sky of ones is in the window of each image."""
@@ -230,6 +226,14 @@ class NearStar:
     def fit(self) -> LeastSquares:
         """The least squares of stars, halos, and extended source and its level."""
         return LeastSquares(self.images, self.fields, self.prior, N_STEPS, self._finished)
+
+    @cached_property
+    def fit_beside_known(self) -> LeastSquares:
+        """Those with the extended source known, where PSFs are not."""
+        held = np.zeros(len(self.prior))
+        held[self.n - len(self._cusps) : self.n] = HELD
+        prior = self.prior + np.diag(held)
+        return LeastSquares(self.images, self.fields[2:], prior, N_STEPS, self._finished)
 
     @cached_property
     def fields(self) -> list[Field]:
@@ -290,6 +294,16 @@ class NearStar:
         )
 
 
+def offsets_from(scene: Scene, star: int, window: Window) -> tuple[Array, Array]:
+    """Return how far below, (height, 1), and right, (width,), of a star the sky in a window is."""
+    window, at = window.finer(scene.oversample), on_sky(scene.stars[star], scene.oversample)[::-1]
+    rows, columns = (
+        (first + np.arange(k) - place + n / 2) % n - n / 2
+        for first, k, place, n in zip(window[:2], window.shape, at, scene.grid, strict=True)
+    )
+    return rows[:, None], columns
+
+
 def _texture_in(window: Window, around: Surroundings) -> tuple[tuple[slice, slice], Texture]:
     """Return the texture round a window of the images, and where the window lies in it."""
     scene, width = around.scene, around.width
@@ -310,16 +324,18 @@ def _texture_in(window: Window, around: Surroundings) -> tuple[tuple[slice, slic
     return (there[0], there[1]), Texture(extended, stars[inside], width, around.hidden[inside])
 
 
-def _window_round(scene: Scene, star: Array, side: float) -> Window:
-    """Return a window of so many pixels of the sky round a star.
+def window_round(around: Surroundings, star: int) -> tuple[Window, float]:
+    """Return a window of the images round a star, and the radius that no image has observed.
 
     It is the whole axis of the grid where that is not twice as long.
     """
-    length = int(np.ceil(side / scene.oversample))
+    scene, place = around.scene, around.scene.stars[star]
+    hidden = hidden_radius(scene, place, around.width)
+    length = int(np.ceil((WINDOW * around.width + 2.0 * hidden) / scene.oversample))
     size = scipy.fft.next_fast_len(length, real=True)
     height, width = (size if 2 * size <= n else n for n in scene.image_grid)
-    x, y = np.round(star).astype(int).tolist()
-    return Window(y - height // 2, x - width // 2, (height, width))
+    x, y = np.round(place).astype(int).tolist()
+    return Window(y - height // 2, x - width // 2, (height, width)), hidden
 
 
 def _neighbours(scene: Scene, star: int, resolution: float) -> NDArray[np.int_]:

@@ -259,10 +259,12 @@ class PixelErrors:
     ----------
     at : ndarray of float64, shape (n_psfs, height, width)
         The current value of x, which is 0.
+    scatter : ndarray of float64, shape (p, height, width)
+        The a_j, 0 or more.
     """
 
     def __init__(self, light: Array, scatter: Array, numbers: NDArray[np.int_]) -> None:
-        self._scatter, self._numbers = scatter.clip(0.0), numbers
+        self.scatter, self._numbers = scatter.clip(0.0), numbers
         total = np.maximum(light.sum(axis=(1, 2), keepdims=True), np.finfo(float).tiny)
         self._shares = light / total
         self._smooth = SmoothField(light.shape[1:], CORRELATED)
@@ -271,14 +273,14 @@ class PixelErrors:
     def forward(self, x: Array) -> Iterator[Array]:
         """Yield the changes of the images, shape (height, width)."""
         fields = [self._smooth.apply(each) for each in x]
-        for shares, scatter, k in zip(self._shares, self._scatter, self._numbers, strict=True):
+        for shares, scatter, k in zip(self._shares, self.scatter, self._numbers, strict=True):
             change = scatter * fields[k]
             yield change - shares * change.sum()
 
     def adjoint(self, images: Sequence[Array]) -> Array:
         """Return the transpose of `forward` applied to images, shape (n_psfs, height, width)."""
         back = np.zeros_like(self.at)
-        parts = zip(self._shares, self._scatter, self._numbers, images, strict=True)
+        parts = zip(self._shares, self.scatter, self._numbers, images, strict=True)
         for shares, scatter, k, image in parts:
             back[k] += scatter * (image - np.sum(shares * image))
         return np.array([self._smooth.apply(each) for each in back])

@@ -1,0 +1,121 @@
+"""Points beside stars that are held while PSFs are fitted: found where they are, and no others."""
+
+import logging
+
+import numpy as np
+import pytest
+
+import lnocl
+from lnocl.core.runs import companions as room
+from lnocl.core.runs.companions import companions
+from lnocl.core.scene.estimate import Estimate
+from lnocl.core.scene.forward_model import Model
+from lnocl.core.scene.scene import Scene
+from lnocl.core.solvers.near_star import NearStar, Surroundings
+from lnocl.core.solvers.psf_errors import CORRELATED
+
+N, STAR, FLUX, LEVEL = 48, (23.3, 24.6), 1e6, 50.0
+Y, X = np.indices((N, N), float)
+R, SIDE = np.hypot(X - STAR[0], Y - STAR[1]), X - STAR[0]
+WIDTHS, DEPTHS = (3.2, 3.6), (1.0, 0.6)
+# 1.5 and 2.4 widths of the PSFs away, on both sides.
+POINTS = {(27.6, 27.9): 3e4, (15.7, 21.9): 1e4}
+
+
+def psf(width, skew=0.1):
+    """Return a lopsided Moffat function of a full width at half maximum."""
+    y, x = np.indices((31, 31)) - 15.0
+    square = width**2 / 4 / (2 ** (1 / 3.5) - 1)
+    values = (1 + (x**2 + 1.2 * y**2 + 0.2 * x * y) / square) ** -3.5
+    values *= 1 + skew * np.tanh(x / width)
+    return values / values.sum()
+
+
+def observe(points=(), sky=None, wrong=1.0, skew=0.1, error=0.03):
+    """Return images of a star, points and a sky, whose PSFs are not those that are given."""
+    known = {"background": LEVEL, "psf_centre": "given", "exposure": DEPTHS, "psf_error": error}
+    true = [psf(width, skew) for width in WIDTHS]
+    stars = [STAR, *points]
+    flat = Scene(lnocl.Observation(np.full((2, N, N), LEVEL), true, **known), stars)
+    fluxes = np.array([FLUX, *dict(points).values()]) / flat.unit
+    sky = np.zeros((N, N)) if sky is None else sky
+    means = Model(flat).images(sky / flat.unit, fluxes) * flat.scale
+    counts = np.random.default_rng(4).poisson(means)
+    return lnocl.Observation(counts, [psf(wrong * width) for width in WIDTHS], **known)
+
+
+def start(observation, sky=1.0):
+    """Return an estimate that has the star, and the sky or a level."""
+    sky = np.broadcast_to(sky, (N, N)) + 0.0
+    return Estimate(Scene(observation, [STAR]), sky, np.array([FLUX]))
+
+
+@pytest.mark.parametrize("wrong", [1.0, 1.03])
+def test_points_are_found_where_they_are_though_psfs_are_wrong(wrong):
+    found = companions(start(observe(POINTS, wrong=wrong)))
+    assert len(found) == len(POINTS)
+    for place in POINTS:
+        assert np.hypot(*(found - place).T).min() < 0.3
+
+
+def light(values):
+    return 3e5 * values / values.sum()
+
+
+NONE = {
+    "host": light(np.exp(-R / 4.0)),
+    "ring": light(np.exp(-((R - 8) ** 2) / 6) * (1 + 0.6 * SIDE / (R + 1))),
+    "jet": light(np.exp(-((SIDE - 7) ** 2) / 20 - (Y - STAR[1]) ** 2 / 8)),
+}
+
+
+@pytest.mark.parametrize("name", NONE)
+def test_extended_sources_are_no_points(name):
+    assert len(companions(start(observe(sky=NONE[name]), NONE[name]))) == 0
+
+
+@pytest.mark.parametrize("wrong", [{"wrong": 1.04}, {"skew": -0.05}, {"skew": 0.2}])
+def test_errors_of_psfs_are_no_points(wrong):
+    assert len(companions(start(observe(**wrong)))) == 0
+
+
+def test_fluxes_are_those_of_least_squares_with_all_unknowns():
+    estimate = start(observe(POINTS, wrong=1.02))
+    near = NearStar(Surroundings(estimate, False), 0, 1e-3)
+    y, x = 14, 19
+    fluxes, errors = room._points(near, estimate, (np.array([y]), np.array([x])))
+    point = np.zeros(near.expected.shape)
+    point[y, x] = 1.0
+    n, rows, right = len(near.prior), [], []
+    pixels = near.fields[2].scatter
+    whole = near.source.images_of(near.expected + estimate.part(near.places(estimate.scene)))
+    each = zip(near.images, pixels, near.source.images_of(point), whole, DEPTHS, strict=True)
+    for image, scatter, seen, extended, depth in each:
+        columns = np.zeros((n + 2, image.left.size))
+        columns[image.unknowns], columns[n], columns[n + 1] = image.slopes, depth, seen.ravel()
+        variance = 1 / image.precision + 2 * np.pi * (CORRELATED * scatter) ** 2
+        rows.append(columns / np.sqrt(variance).ravel())
+        right.append(((image.left + extended) / np.sqrt(variance)).ravel())
+    roots = np.zeros((n + 2, n))
+    roots[:n] = np.linalg.cholesky(near.prior + 1e-14 * np.eye(n))
+    matrix = np.concatenate([*rows, roots], axis=1).T
+    values = np.concatenate([*right, np.zeros(n)])
+    solved = np.linalg.lstsq(matrix, values, rcond=None)[0]
+    expected = np.sqrt(np.linalg.inv(matrix.T @ matrix)[-1, -1])
+    assert fluxes[0] == pytest.approx(solved[-1], rel=1e-3)
+    assert errors[0] == pytest.approx(expected, rel=1e-3)
+
+
+@pytest.mark.filterwarnings("ignore:held-out counts have chosen")
+def test_a_companion_that_is_not_named_stays_out_of_the_psf(caplog):
+    """One width away, beside a PSF 3 % too wide; a third of it went to the PSF."""
+    place, flux = (26.5, 25.2), 2e4
+    observation = observe({place: flux}, wrong=1.03)
+    with caplog.at_level(logging.INFO, "lnocl"):
+        result = lnocl.deconvolve(observation, [STAR], engine="numpy")
+    (line,) = (each for each in caplog.messages if "beside stars held" in each)
+    assert line.startswith("1 point beside stars held while PSFs are fitted, (26.")
+    assert len(result.star_fluxes) == 1
+    is_near = np.hypot(X - place[0], Y - place[1]) < 2.4
+    assert result.extended[is_near].sum() == pytest.approx(flux, rel=0.1)
+    assert abs(result.star_fluxes[0] - FLUX) < 2 * result.star_flux_errors[0]
