@@ -167,13 +167,13 @@ class GuardedRuns:
                     break
         return found
 
-    def settled(self, psfs: Psfs) -> Psfs:
+    def settled(self, psfs: Psfs, stars: Array) -> Psfs:
         """Return PSFs as the images show them at the stars, or those given where they stay.
 
-        All are of the whole images.
+        All are of the whole images; stars are positions in the window.
         """
         observation = self.seen_through(psfs)
-        setup = replace(self._setup, observation=observation, stars=inside(self.stars, observation))
+        setup = replace(self._setup, observation=observation, stars=inside(stars, observation))
         steps = settle_psfs(setup, Penalty(smoothing=self._smoothing), self._tick)
         whole = self._whole.replace(psfs=psfs)
         for step in steps:

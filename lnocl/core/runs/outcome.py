@@ -250,7 +250,7 @@ class Outcome:
 
     def _fits_worse_than(self, other: Outcome) -> bool:
         """Return whether the core of a star fits far worse than in another outcome."""
-        pairs = zip(self.star_residuals(), other.star_residuals(), strict=True)
+        pairs = zip(judge_stars(self.estimate), judge_stars(other.estimate), strict=True)
         return any(
             here.core.is_misfit and here.core.rms > WORSE * there.core.rms for here, there in pairs
         )

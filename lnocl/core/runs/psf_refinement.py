@@ -94,15 +94,15 @@ def mend(
 ) -> Mended:
     """Return a setup whose positions and PSFs are mended where the images ask for it.
 
-    PSFs that may have an error become the mean of what the stars show of it
-    (`lnocl.core.runs.psf_posterior`), unless they fit worse so. Where they are off by no more than
-    that error holds then, neither jitter nor pixels are fitted unasked, and stars take their
-    marginal fluxes.
+    The noise of PSFs is taken from their wings first. PSFs that may have an error then become the
+    mean of what the stars show of it (`lnocl.core.runs.psf_posterior`), unless they fit worse so.
+    Where they are off by no more than that error holds, neither jitter nor pixels are fitted
+    unasked, and stars take their marginal fluxes.
 
-    What does not fit is mended: stars are moved first, then the noise of PSFs is taken from
-    their wings, the families are fitted, and pixels freed. Each is tried only where the misfit
-    before is in doubt. It is taken where it leaves less than half of kappa, or nothing to doubt,
-    and every star more than half its flux. Wings without noise are taken where they lower kappa.
+    What does not fit then is mended: stars are moved, the families are fitted, and pixels freed.
+    Each is tried only where the misfit before is in doubt. It is taken where it leaves less than
+    half of kappa, or nothing to doubt, and every star more than half its flux. Wings without noise
+    are taken where they lower kappa.
 
     Free pixels fit any star, and may take some of its surroundings for the PSF. So they are to
     leave less than 0.3 of kappa, and the error that is allowed for is the one before them.
@@ -126,24 +126,23 @@ def mend(
         note(f"PSFs are not judged: {number} in the window; name `refine_psfs` to judge them")
         return Mended(setup)
     psfs = observation.psfs_over_images
-    given = _State(psfs, runs.fit(psfs, runs.stars, moves is True), moves is True)
-    if names and observation.psf_error:
-        given = _settle(runs, given)
-    if given.psfs is not psfs:
-        psfs = given.psfs
-        _tell_widths(observation, psfs)
-    if not is_asked and _is_held(given.misfit, observation):
-        names = [name for name in names if name not in TAKING]
-    state = given
-    if state.misfit.is_doubtful and moves == "auto":
-        state = _move(runs, state)
+    given = state = _State(psfs, runs.fit(psfs, runs.stars, moves is True), moves is True)
     if state.misfit.is_doubtful and names and (observation.psfs < 0).any():
         state = _clean(runs, state)
+    done = ["the noise of wings taken"] if state.psfs is not psfs else []
+    if names and observation.psf_error:
+        settled = _settle(runs, state)
+        if settled is not state:
+            _tell_widths(observation.replace(psfs=state.psfs), settled.psfs)
+        given, state = (settled if state is given else given), settled
+    if state.misfit.is_doubtful and moves == "auto":
+        state = _move(runs, state)
+    if not is_asked and _is_held(state.misfit, observation):
+        names = [name for name in names if name not in TAKING]
     of_parameters = [name for name in names if name != "pixels"]
     families = PsfFamilies(of_parameters, observation.replace(psfs=state.psfs))
     values, tried, left = np.zeros((observation.n_images, len(families.prior))), state, None
     is_fitted = False  # whether the PSFs used have these values
-    done = ["the noise of wings taken"] if state.psfs is not psfs else []
     if state.misfit.is_doubtful and families.parameters:
         tried, values = _fit(runs, families, state, moves is not False)
         if is_fitted := state.is_mended_by(tried):
@@ -208,10 +207,11 @@ def _shows_pixels(misfit: PsfMisfit) -> bool:
 
 def _settle(runs: GuardedRuns, state: _State) -> _State:
     """Return the state with PSFs that are the mean of what they may be, unless they fit worse."""
-    psfs = runs.settled(state.psfs)
+    stars = state.estimate.scene.places
+    psfs = runs.settled(state.psfs, stars)
     if psfs is state.psfs:
         return state
-    settled = _State(psfs, runs.fit(psfs, runs.stars, state.moves), state.moves)
+    settled = _State(psfs, runs.fit(psfs, stars, state.moves), state.moves)
     is_worse = settled.misfit.significance > state.misfit.significance + GONE
     return state if is_worse else settled
 
