@@ -167,18 +167,20 @@ class GuardedRuns:
                     break
         return found
 
-    def settled(self, psfs: Psfs, stars: Array) -> Psfs:
-        """Return PSFs as the images show them at the stars, or those given where they stay.
+    def settled(self, psfs: Psfs, stars: Array, moves: bool) -> tuple[Psfs, Array]:
+        """Return PSFs, of the whole images, and stars, in the window, as the images show them.
 
-        All are of the whole images; stars are positions in the window.
+        Those given are returned where they stay. Stars stay unless they may move.
         """
         observation = self.seen_through(psfs)
         setup = replace(self._setup, observation=observation, stars=inside(stars, observation))
-        steps = settle_psfs(setup, Penalty(smoothing=self._smoothing), self._tick)
+        penalty = Penalty(smoothing=self._smoothing)
+        steps, found = settle_psfs(setup, penalty, moves, self._tick)
         whole = self._whole.replace(psfs=psfs)
         for step in steps:
             whole = with_errors(whole, step)
-        return whole.psfs_over_images if steps else psfs
+        moved = np.where(found == setup.stars, stars, found)
+        return (whole.psfs_over_images if steps else psfs), moved
 
     def _run(self, setup: Setup, found: Judged, n_iter: int, guard: float) -> Judged:
         """Return the estimate after a run that begins at `found`, with its misfit measured anew.

@@ -24,7 +24,7 @@ from lnocl.core.scene.estimate import Estimate
 from lnocl.core.scene.penalty import Penalty
 from lnocl.core.solvers.least_squares import Field, LeastSquares, LinearImage
 from lnocl.core.solvers.near_star import N_STEPS, NearStar, Surroundings
-from lnocl.core.solvers.psf_errors import N_SHAPES, N_SLOPES, alike, count, with_errors
+from lnocl.core.solvers.psf_errors import N_SHAPES, N_SLOPES, SHIFT, alike, count, with_errors
 from lnocl.errors import DivergedError, NotFiniteError
 from lnocl.process import ignored_notes, ignored_warnings
 
@@ -34,16 +34,21 @@ MOST_STARS = 4
 ROUNDS, MAX_STEP = 3, 6.0
 # Full width at half maximum of the narrowest PSFs that are changed, in their pixels.
 NARROWEST = 2.0
+# What the `psf_error` of PSFs holds is an error of no more than so many times it.
+HELD = 2.0
 # The share of the gradient at which conjugate gradients end.
 FINISHED = 1e-2
 # Iterations of a run, at most.
 N_ITER = 300
 
 
-def settle_psfs(setup: Setup, penalty: Penalty, tick: Callable[[], object] = int) -> list[Array]:
-    """Return steps of theta, shape (n_psfs, N_SHAPES) each, one after the other.
+def settle_psfs(
+    setup: Setup, penalty: Penalty, moves: bool, tick: Callable[[], object] = int
+) -> tuple[list[Array], Array]:
+    """Return steps of theta, shape (n_psfs, N_SHAPES) each, and the places of the stars.
 
-    Shifts are left to the positions, and zero points as they are given. So are wings: what is not
+    Stars are moved that lie farther off than `HELD` times what a PSF may be shifted by. Other
+    shifts are left to the positions, and zero points as they are given. So are wings: what is not
     the extended source's is told from it by its smoothness alone, and each round would hand it more
     of them. PSFs narrower than two of their pixels are left, as their samples do not hold their
     shape. No step follows a run that diverges.
@@ -54,6 +59,8 @@ def settle_psfs(setup: Setup, penalty: Penalty, tick: Callable[[], object] = int
         The images and the parameters of the runs; one star or more among them.
     penalty : Penalty
         Of the runs.
+    moves : bool
+        Whether stars may be moved.
     tick : callable, optional
         Is called after each iteration.
     """
@@ -62,36 +69,39 @@ def settle_psfs(setup: Setup, penalty: Penalty, tick: Callable[[], object] = int
     of_psfs = dict(zip(alike(setup.observation).tolist(), setup.observation.psfs, strict=True))
     is_sampled = np.array([fwhm(of_psfs[k]) >= NARROWEST for k in range(len(theta))])
     if not is_sampled.any():
-        return steps
+        return steps, setup.stars
     with suppress(DivergedError, NotFiniteError), ignored_warnings(), ignored_notes():
         for _ in range(ROUNDS):
             start = settle_halos(make_start(setup, penalty))
             estimate = run_steadily(start, penalty, N_ITER, tick).estimate
-            step = np.where(is_sampled[:, None], _mean(estimate, theta) - theta, 0.0)
+            found, away = _mean(estimate, theta, moves)
+            step = np.where(is_sampled[:, None], found - theta, 0.0)
             steps.append(step * MAX_STEP / max(float(abs(step).max()), MAX_STEP))
             theta = theta + steps[-1]
             setup = replace(
                 setup,
+                stars=setup.stars + away,
                 observation=with_errors(setup.observation, steps[-1]),
                 initial_extended=np.maximum(estimate.observed_sky, 0.0),
                 initial_star_fluxes=estimate.star_fluxes[: estimate.scene.n_stars],
             )
-    return steps
+    return steps, setup.stars
 
 
-def _mean(estimate: Estimate, at: Array) -> Array:
-    """Return the mean of theta by the brightest stars, near PSFs that have it already.
+def _mean(estimate: Estimate, at: Array, moves: bool) -> tuple[Array, Array]:
+    """Return the mean of theta by the brightest stars, and how far all are to be moved, (n, 2).
 
-    Stars with PSFs of their own tell nothing.
+    PSFs have theta `at` already. Stars with PSFs of their own tell nothing.
     """
     scene, n_psfs = estimate.scene, len(at)
-    around, n_epochs = Surroundings(estimate, False), scene.n_epochs
+    around, n_epochs = Surroundings(estimate, moves), scene.n_epochs
+    away = np.zeros((scene.n_stars // n_epochs, 2))
     light = np.where(scene.owned < 0, estimate.star_fluxes[: scene.n_stars], 0.0)
     light = light.reshape(-1, n_epochs).sum(axis=1)
     brightest = np.argsort(-light, kind="stable")[:MOST_STARS]
     brightest = n_epochs * brightest[light[brightest] > 0]
     if not len(brightest):
-        return at
+        return at, away
     nears = [NearStar(around, star, FINISHED) for star in brightest.tolist()]
     nears = [near for near in nears if near.window.shape == nears[0].window.shape]
     owns = np.cumsum([0, *(near.n for near in nears)])
@@ -108,8 +118,14 @@ def _mean(estimate: Estimate, at: Array) -> Array:
     of_psfs = now[owns[-1] : owns[-1] + n_psfs * N_SLOPES].reshape(n_psfs, N_SLOPES)
     of_psfs[:, :N_SHAPES] = at
     change, _ = LeastSquares(images, fields, prior, N_STEPS, FINISHED).solve(now)
+    if moves:
+        least = HELD * SHIFT * scene.observation.psf_error * max(map(fwhm, scene.observation.psfs))
+        for near, first in zip(nears, owns, strict=False):
+            moved = change[first + near.unknowns[0, 1:]]
+            if np.hypot(*moved) > least / scene.oversample:
+                away[near.held[0] // n_epochs] = moved
     found = (now + change)[owns[-1] : owns[-1] + n_psfs * N_SLOPES]
-    return np.asarray(found.reshape(n_psfs, N_SLOPES)[:, :N_SHAPES])
+    return np.asarray(found.reshape(n_psfs, N_SLOPES)[:, :N_SHAPES]), away
 
 
 class _OfWindow:

@@ -21,6 +21,7 @@ from lnocl.core.runs.guarded_runs import (
 )
 from lnocl.core.runs.outcome import Mended, PsfRefinement
 from lnocl.core.runs.psf_allowance import STRENGTH, Allowance
+from lnocl.core.runs.psf_posterior import HELD
 from lnocl.core.runs.start import Setup
 from lnocl.core.scene.arrays import Array
 from lnocl.core.scene.cores import fwhm
@@ -44,8 +45,6 @@ CLEANED = 0.99
 # Free pixels, which may fit anything, are to leave less than this share of kappa. Where it is not
 # significant they are tried above this kappa.
 FITTED, FREED = 0.3, 0.1
-# What their `psf_error` holds of PSFs is an error of no more than so many times it.
-HELD = 2.0
 # Families that take a host, or a companion, for the PSF: unasked they are fitted beyond it alone.
 TAKING = "jitter", "pixels"
 # Rounds of a search: each takes so many steps, and judges the PSFs. It ends where a round lowers
@@ -131,7 +130,7 @@ def mend(
         state = _clean(runs, state)
     done = ["the noise of wings taken"] if state.psfs is not psfs else []
     if names and observation.psf_error:
-        settled = _settle(runs, state)
+        settled = _settle(runs, state, moves is not False)
         if settled is not state:
             _tell_widths(observation.replace(psfs=state.psfs), settled.psfs)
         given, state = (settled if state is given else given), settled
@@ -205,13 +204,15 @@ def _shows_pixels(misfit: PsfMisfit) -> bool:
     return misfit.is_significant or misfit.kappa > FREED
 
 
-def _settle(runs: GuardedRuns, state: _State) -> _State:
+def _settle(runs: GuardedRuns, state: _State, moves: bool) -> _State:
     """Return the state with PSFs that are the mean of what they may be, unless they fit worse."""
-    stars = state.estimate.scene.places
-    psfs = runs.settled(state.psfs, stars)
-    if psfs is state.psfs:
+    places = state.estimate.scene.places
+    psfs, stars = runs.settled(state.psfs, places, moves)
+    is_moved = bool((stars != places).any())
+    if psfs is state.psfs and not is_moved:
         return state
-    settled = _State(psfs, runs.fit(psfs, stars, state.moves), state.moves)
+    moves = state.moves or is_moved
+    settled = _State(psfs, runs.fit(psfs, stars, moves), moves)
     is_worse = settled.misfit.significance > state.misfit.significance + GONE
     return state if is_worse else settled
 
