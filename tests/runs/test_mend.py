@@ -106,7 +106,7 @@ def test_noise_that_is_given_too_large_hides_no_wrong_psf():
 def state(kappa, flux, seen=1.0):
     squares = np.array([seen + 100.0 * kappa**2])
     misfit = PsfMisfit(squares, seen, 1.0, 100.0, np.zeros(1))
-    fluxes, scene = np.array([1e4, flux]), SimpleNamespace(n_stars=2)
+    fluxes, scene = np.array([1e4, flux]), SimpleNamespace(n_stars=2, places=np.ones((2, 2)))
     estimate = SimpleNamespace(misfit=misfit, star_fluxes=fluxes, scene=scene)
     return _State(PSF, estimate, False)
 
@@ -124,14 +124,18 @@ def test_psfs_that_leave_no_star_to_judge_by_are_refused():
     assert not before.is_mended_by(state(0.19, 1e4))
 
 
-def test_psfs_that_stars_show_are_used_unless_they_fit_worse():
+@pytest.mark.parametrize("is_moved", [False, True])
+def test_psfs_and_places_that_stars_show_are_used_unless_they_fit_worse(is_moved):
     before, psfs = state(0.2, 1e4), PSF.copy()
     for kappa, is_used in ((0.1, True), (0.21, True), (0.25, False)):
-        runs = SimpleNamespace(stars=None, settled=lambda _: psfs)
+        runs = SimpleNamespace(stars=None, settled=lambda _, places, moves: (psfs, places + moves))
         runs.fit = lambda *_, kappa=kappa: state(kappa, 1e4).estimate
-        found = _settle(runs, before)
+        found = _settle(runs, before, is_moved)
         assert found.psfs is (psfs if is_used else PSF)
+        assert found.moves == (is_used and is_moved)
         assert found.misfit.kappa == pytest.approx(kappa if is_used else 0.2)
+    runs.fit = lambda *_: state(0.0, 0.4e4).estimate  # a star has lost its light
+    assert _settle(runs, before, is_moved) is before
 
 
 def test_free_pixels_are_refused_that_fit_in_part_or_change_a_flux_by_more_than_the_error():

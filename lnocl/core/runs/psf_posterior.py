@@ -36,6 +36,8 @@ ROUNDS, MAX_STEP = 3, 6.0
 NARROWEST = 2.0
 # What the `psf_error` of PSFs holds is an error of no more than so many times it.
 HELD = 2.0
+# The standard deviation of a place that is given, pixels.
+AWAY = 1.0
 # The share of the gradient at which conjugate gradients end.
 FINISHED = 1e-2
 # Iterations of a run, at most.
@@ -114,6 +116,11 @@ def _mean(estimate: Estimate, at: Array, moves: bool) -> tuple[Array, Array]:
         fields += [_OfWindow(field, k * p, p, len(nears) * p) for field in near.fields]
     shared = nears[0].prior[nears[0].n :, nears[0].n :]
     prior = block_diag(*(near.prior[: near.n, : near.n] for near in nears), shared)
+    if moves:
+        of_places = np.concatenate(
+            [first + near.unknowns[:, 1:].ravel() for near, first in zip(nears, owns, strict=False)]
+        )
+        prior[of_places, of_places] += AWAY**-2
     now = np.zeros(len(prior))
     of_psfs = now[owns[-1] : owns[-1] + n_psfs * N_SLOPES].reshape(n_psfs, N_SLOPES)
     of_psfs[:, :N_SHAPES] = at
@@ -121,11 +128,24 @@ def _mean(estimate: Estimate, at: Array, moves: bool) -> tuple[Array, Array]:
     if moves:
         least = HELD * SHIFT * scene.observation.psf_error * max(map(fwhm, scene.observation.psfs))
         for near, first in zip(nears, owns, strict=False):
-            moved = change[first + near.unknowns[0, 1:]]
+            moved = _moved(near, estimate, change[first:])
             if np.hypot(*moved) > least / scene.oversample:
                 away[near.held[0] // n_epochs] = moved
     found = (now + change)[owns[-1] : owns[-1] + n_psfs * N_SLOPES]
     return np.asarray(found.reshape(n_psfs, N_SLOPES)[:, :N_SHAPES]), away
+
+
+def _moved(near: NearStar, estimate: Estimate, change: Array) -> Array:
+    """Return how far a star is to be moved, (x, y), pixels.
+
+    A star that has lost light to the extended source is moved too far by its flux of before: what
+    is linear is the product of both.
+    """
+    star, n_epochs = int(near.held[0]), estimate.scene.n_epochs
+    is_there = near.held // n_epochs == star // n_epochs
+    flux = float(estimate.fluxes[near.held[is_there]].sum())
+    after = flux + float(change[near.unknowns[is_there, 0]].sum())
+    return change[near.unknowns[0, 1:]] * (flux / after if after > 0 else 0.0)
 
 
 class _OfWindow:

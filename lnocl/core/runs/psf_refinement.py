@@ -214,7 +214,8 @@ def _settle(runs: GuardedRuns, state: _State, moves: bool) -> _State:
     moves = state.moves or is_moved
     settled = _State(psfs, runs.fit(psfs, stars, moves), moves)
     is_worse = settled.misfit.significance > state.misfit.significance + GONE
-    return state if is_worse else settled
+    is_faded = (_of_stars(settled) < FADED * _of_stars(state)).any()
+    return state if is_worse or is_faded else settled
 
 
 def _move(runs: GuardedRuns, state: _State) -> _State:
