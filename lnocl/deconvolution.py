@@ -174,12 +174,11 @@ def deconvolve(
         needs `pupils`), modes (needs `psf_modes`), pixels. They are used where they fit better. By
         default, where `smoothing` is "auto", these are jitter, of several images shift, those that
         need what is given, and pixels. Where the `psf_error` of the observation is not 0, PSFs
-        first become what the stars show of them; pixels are then fitted only where more than a
-        tenth is wrong.
+        first become what the stars show of them; jitter and pixels are then fitted only where PSFs
+        are off by more than twice that.
 
         The extended source is marginalised. An empty sequence is for none, and leaves PSFs as they
-        are given. See Notes. At least one
-        star.
+        are given. See Notes. At least one star.
     mend_images : bool, optional
         Mask saturated cores of stars and cosmic rays, and fit relative exposures to stars, where
         `smoothing` is "auto".
@@ -287,9 +286,11 @@ def deconvolve(
     **PSFs are never exact**, unless the `psf_error` of the observation is 0. Stretch, blur and
     wings of each, the errors of its pixels (``psf_scatter`` where that is more), the light beyond
     its file, zero points of images and a cusp of the extended source under each star are unknowns
-    beside the stars, with priors (`lnocl.core.solvers.psf_errors`). Their mean by the brightest
-    stars, after a run with a fixed weight, makes the PSFs of the reconstruction, three times in
-    turn (`lnocl.core.runs.psf_posterior`). All of them are marginalised in the errors of fluxes and
+    beside the stars, with priors (`lnocl.core.solvers.psf_errors`). The mean of stretch and blur by
+    the brightest stars, after a run with a fixed weight, makes the PSFs of the reconstruction,
+    three times in turn (`lnocl.core.runs.psf_posterior`). Stars that lie off by more than such PSFs
+    may be shifted are moved, where they may be. Points beside stars that are none of them are held
+    meanwhile (`lnocl.core.runs.companions`). All of it is marginalised in the errors of fluxes and
     places (:doc:`/validation/psf_error`).
 
     **PSFs that do not fit** leave light beside a star, and an extended source that is free there
@@ -297,7 +298,8 @@ def deconvolve(
     extended source is smoothed near the stars as strongly as the PSFs' own error asks for, which
     the residuals at the stars show (`lnocl.core.scene.psf_misfit`, `lnocl.core.runs.guarded_runs`).
     Where their chi squared exceeds its expectation by five standard deviations, or by three and the
-    error is above 0.025, positions and PSFs are refined as far as they may be. They are used where
+    error is above 0.025, positions and PSFs are refined as far as they may be; jitter and pixels
+    unasked only where the error is above twice `psf_error`, or PSFs are exact. They are used where
     they take two standard deviations or more, and leave less than half of the error, or nothing
     that noise does not explain. Free pixels, which may fit anything, are used where they leave less
     than 0.3 of it, and change no star's flux by more than κ. Read noise that is larger than the
@@ -317,7 +319,8 @@ def deconvolve(
     Images that are turned, of several epochs or with halos are judged alike, each PSF in the frame
     of its image. Of PSFs that vary over an image all are changed alike.
 
-    **Star fluxes are marginal** where PSFs were judged and fit. What lies under a star belongs to
+    **Star fluxes are marginal** where PSFs were judged, and fit or are off by no more than twice
+    their `psf_error`, unless the core of a star fits far worse with them. What lies under a star belongs to
     it or to the extended source, and early iterations leave it to the star. So after the last
     iteration each star takes a step of Newton to the flux that the counts give it with the extended
     source marginalised (`lnocl.core.solvers.marginal`). The extended source takes up what stars

@@ -87,7 +87,7 @@ NEEDS: dict[str, tuple[Condition, ...]] = {
 }
 # Of steps that hang on what those before find: where they are done.
 UNLESS_WRONG = "unless PSFs are wrong"
-WHERE = {PRIOR: UNLESS_WRONG, CHOICE: UNLESS_WRONG, STARS: "where PSFs fit"}
+WHERE = {PRIOR: UNLESS_WRONG, CHOICE: UNLESS_WRONG, STARS: "where PSFs nearly fit"}
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,7 +142,7 @@ class Plan:
     settle halos: no, there are no halos
     give stars a prior by a run with a fixed weight: yes, unless PSFs are wrong
     choose the iteration by held-out counts: yes, unless PSFs are wrong
-    take marginal star fluxes: yes, where PSFs fit
+    take marginal star fluxes: yes, where PSFs nearly fit
     """
 
     setup: Setup
