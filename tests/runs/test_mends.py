@@ -80,6 +80,11 @@ class TestExposures:
         plan = lnocl.plan(dimmed(epochs=[0, 1, 2]), [STAR])
         assert plan.why_not(EXPOSURES) == "stars may vary from epoch to epoch"
 
+    def test_halos_may_be_taken_for_the_light_of_stars(self):
+        halo = lopsided(*STAR, SIZE)
+        plan = lnocl.plan(dimmed(halos=[halo]), [STAR])
+        assert plan.why_not(EXPOSURES) == "halos may be as bright beside stars"
+
     def test_what_is_found_comes_back_from_a_result(self):
         given = dimmed(exposure=[2.0, 2.0, 2.0])
         result = lnocl.deconvolve(given, [STAR], engine="numpy", n_iter=5, stop=None)

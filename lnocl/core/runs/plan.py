@@ -67,6 +67,9 @@ SHOWS_PSFS = Condition(
     "all stars have PSFs of their own",
 )
 HAS_HALOS = Condition(lambda plan: len(plan.setup.observation.halos) > 0, "there are no halos")
+NO_HALOS = Condition(
+    lambda plan: not len(plan.setup.observation.halos), "halos may be as bright beside stars"
+)
 HAS_ERROR = Condition(
     lambda plan: bool(plan.setup.observation.background_error.any()), "backgrounds have no error"
 )
@@ -77,7 +80,7 @@ WHOLE = Condition(lambda plan: not plan.in_tiles, "the images are divided into t
 NEEDS: dict[str, tuple[Condition, ...]] = {
     CORES: (AUTO, MENDS, HAS_STARS),
     RAYS: (AUTO, MENDS),
-    EXPOSURES: (AUTO, MENDS, HAS_STARS, SEVERAL, ONE_EPOCH),
+    EXPOSURES: (AUTO, MENDS, HAS_STARS, SEVERAL, ONE_EPOCH, NO_HALOS),
     LEVELS: (AUTO, HAS_ERROR, WHOLE),
     PSFS: (AUTO, HAS_STARS, SHOWS_PSFS),
     HALOS: (AUTO, HAS_HALOS),
