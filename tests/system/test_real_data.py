@@ -97,8 +97,8 @@ class TestLensedQuasar:
         fits.writeto(self.IMAGE, rates * seconds + 26.9, header)
         stars = [word for x, y in self.STARS for word in ("--star", f"{x},{y}")]
         psf = str(where / "quasar_F814W_psf.fits")
-        return ["deconvolve", self.IMAGE, "--psf", psf, "--psf-error", "0", "--background", "26.9", *stars,
-                *PAPER, "--n-iter", "60", "--mu", "1e-7", "--pad", "4"]  # fmt: skip
+        return ["deconvolve", self.IMAGE, "--psf", psf, "--background", "26.9", *stars, *PAPER,
+                "--psf-error", "0", "--n-iter", "60", "--mu", "1e-7", "--pad", "4"]  # fmt: skip
 
     @engines
     def test_what_comes_out(self, arguments, engine, capsys):
