@@ -320,11 +320,11 @@ def deconvolve(
     of its image. Of PSFs that vary over an image all are changed alike.
 
     **Star fluxes are marginal** where PSFs were judged, and fit or are off by no more than twice
-    their `psf_error`, unless the core of a star fits far worse with them. What lies under a star
-    belongs to it or to the extended source, and early iterations leave it to the star. So after the
-    last iteration each star takes a step of Newton to the flux that the counts give it with the
-    extended source marginalised (`lnocl.core.solvers.marginal`). The extended source takes up what
-    stars lose. A callback and the history have the iterations as they were.
+    their `psf_error`. What lies under a star belongs to it or to the extended source, and early
+    iterations leave it to the star. So after the last iteration each star takes a step of Newton to
+    the flux that the counts give it with the extended source marginalised
+    (`lnocl.core.solvers.marginal`). The extended source takes up what stars lose. A callback and
+    the history have the iterations as they were.
 
     **Levels** of backgrounds with a `background_error` are fitted after a short run, and again at
     the end, with a gradient (`lnocl.core.solvers.levels`). Their errors are in those of star fluxes

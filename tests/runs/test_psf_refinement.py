@@ -408,21 +408,6 @@ class TestAScatterThatIsGiven:
         np.testing.assert_array_equal(beside._observation.psf_scatter, [scatter])
 
 
-@pytest.mark.parametrize(("share", "is_taken"), [(0.5, False), (1.0, True)])
-def test_marginal_fluxes_that_do_not_explain_a_star_are_not_taken(share, is_taken, monkeypatch):
-    observation = lnocl.Observation(images_through([PSF], 30.0), PSF, background=LEVEL)
-    options = {"engine": "numpy", "n_iter": 20, "stop": None}
-    before = lnocl.deconvolve(observation, [STAR], **options)._outcome
-    moved = before.estimate.changed(before.estimate.sky, share * before.star_fluxes)
-    monkeypatch.setattr(
-        "lnocl.core.runs.outcome.marginalise",
-        lambda estimate, stars, *_: moved if stars else estimate,
-    )
-    after = before.marginal(True, False, False)
-    assert after.is_marginal is is_taken
-    np.testing.assert_allclose(after.star_fluxes, before.star_fluxes, rtol=1e-12)
-
-
 @pytest.mark.parametrize("exposure", [1.0, 40.0])
 def test_what_may_be_faked_is_the_share_of_the_light_in_the_sky(exposure):
     true = TestAnErrorThatIsLeft.TRUE

@@ -25,9 +25,6 @@ if TYPE_CHECKING:
 
 CURVE_DTYPE = np.dtype([("smoothing", np.float64), ("iteration", np.int64), ("error", np.float64)])
 
-# Marginal fluxes leave no more than so many times the residuals in the core of a star.
-WORSE = 1.5
-
 
 @dataclass(frozen=True)
 class PsfRefinement:
@@ -230,29 +227,15 @@ class Outcome:
         return self.setup.refine_positions and self.scene.n_stars > 0
 
     def marginal(self, stars: bool, halos: bool, levels: bool) -> Outcome:
-        """Return the outcome with marginal star fluxes, amounts of halos, or levels fitted.
-
-        Fluxes that leave the core of a star unexplained, where those before do not, are not taken:
-        the least squares are linear, and PSFs that are noisy may lead them astray.
-        """
+        """Return the outcome with marginal star fluxes, amounts of halos, or levels fitted."""
         estimate = marginalise(self.estimate, stars, halos, levels)
-        found = replace(
+        return replace(
             self,
             setup=replace(self.setup, observation=estimate.scene.observation),
             estimate=estimate,
             is_marginal=stars,
             has_marginal_halos=halos,
             has_levels=levels,
-        )
-        if stars and found._fits_worse_than(self):
-            return self.marginal(False, halos, levels)
-        return found
-
-    def _fits_worse_than(self, other: Outcome) -> bool:
-        """Return whether the core of a star fits far worse than in another outcome."""
-        pairs = zip(judge_stars(self.estimate), judge_stars(other.estimate), strict=True)
-        return any(
-            here.core.is_misfit and here.core.rms > WORSE * there.core.rms for here, there in pairs
         )
 
     def of_halos(self, fluxes: Array) -> Array:
