@@ -110,7 +110,7 @@ class TestRays:
         psf = PSF if oversample == 1 else np.repeat(np.repeat(PSF, 2, 0), 2, 1)
         given = lnocl.Observation([image, image + rays], psf, background=LEVEL,
                                   oversample=oversample)  # fmt: skip
-        prepared = prepare(lnocl.plan(given, refine_psfs=()))
+        prepared = prepare(lnocl.plan(given, engine="numpy", refine_psfs=()))
         mask = prepared.setup.observation.mask
         assert mask[1][rays > 0].all()
         assert not mask[0].any()
@@ -121,7 +121,9 @@ class TestRays:
         rays = np.zeros_like(image)
         rays[17, 21] = 4e3
         given = lnocl.Observation([image + rays, image], PSF, background=LEVEL)
-        mask = prepare(lnocl.plan(given, [STAR], refine_psfs=())).setup.observation.mask
+        mask = prepare(
+            lnocl.plan(given, [STAR], engine="numpy", refine_psfs=())
+        ).setup.observation.mask
         assert mask[0, 17, 21]
         assert mask[0].sum() == mask[0, 16:19, 20:23].sum()  # with what the ray spreads to
         assert not mask[1].any()
@@ -138,10 +140,10 @@ class TestRays:
         image, _ = self.image()
         y, x = np.indices((41, 41)) - 20
         given = lnocl.Observation(image, np.exp(-(x**2 + y**2) / 1e3), background=LEVEL)
-        assert not prepare(lnocl.plan(given, [STAR], refine_psfs=())).found[RAYS]
+        assert not prepare(lnocl.plan(given, [STAR], engine="numpy", refine_psfs=())).found[RAYS]
 
     def test_noise_beyond_that_of_counts_is_none(self):
         """As in images whose unit is not electrons."""
         counts = np.random.default_rng(3).normal(LEVEL, 5.0 * LEVEL**0.5, (64, 64))
         given = lnocl.Observation(counts.clip(0.0), PSF, background=LEVEL)
-        assert not prepare(lnocl.plan(given)).setup.observation.mask.any()
+        assert not prepare(lnocl.plan(given, engine="numpy")).setup.observation.mask.any()
