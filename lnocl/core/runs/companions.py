@@ -27,16 +27,15 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
-from lnocl.core.runs.guarded_runs import GuardedRuns, inside
+from lnocl.core.runs.guarded_runs import GuardedRuns
 from lnocl.core.runs.halos import settle_halos
 from lnocl.core.runs.psf_posterior import NARROWEST
 from lnocl.core.runs.start import Setup, make_start
-from lnocl.core.runs.steady import STEADY, run_steadily
+from lnocl.core.runs.steady import run_steadily
 from lnocl.core.scene.arrays import Array
 from lnocl.core.scene.detector import on_sky
 from lnocl.core.scene.estimate import Estimate
 from lnocl.core.scene.fields import PSF_ERROR
-from lnocl.core.scene.penalty import Penalty, recommend_smoothing
 from lnocl.core.scene.texture import Texture
 from lnocl.core.solvers.fluxes import variances
 from lnocl.core.solvers.least_squares import ROUNDING, LinearImage
@@ -69,21 +68,12 @@ def beside_stars(setup: Setup, tick: Callable[[], object] = int) -> Array:
     tick : callable, optional
         Is called after each iteration.
     """
-    runs = GuardedRuns(setup)
-    observation = runs.seen_through(setup.observation.psfs_over_images)
-    near = replace(
-        setup,
-        observation=observation,
-        stars=inside(runs.stars, observation),
-        solver="sgp",
-        refine_positions=False,
-        initial_extended=None,
-        initial_star_fluxes=None,
-    )
-    penalty, places = Penalty(smoothing=STEADY * recommend_smoothing(observation)), np.zeros((0, 2))
+    runs, places = GuardedRuns(setup), np.zeros((0, 2))
+    near = runs.setup_of(setup.observation.psfs_over_images, runs.stars)
+    near = replace(near, refine_positions=False)
     with suppress(DivergedError, NotFiniteError), ignored_warnings(), ignored_notes():
-        start = settle_halos(make_start(near, penalty))
-        found = companions(run_steadily(start, penalty, N_ITER, tick).estimate)
+        start = settle_halos(make_start(near, runs.penalty))
+        found = companions(run_steadily(start, runs.penalty, N_ITER, tick).estimate)
         places = found + (runs.all_stars[runs.held][0] - runs.stars[0])
     if len(places):
         named = " ".join(f"({x:.4g}, {y:.4g})" for x, y in places)

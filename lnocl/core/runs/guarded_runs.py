@@ -100,6 +100,8 @@ class GuardedRuns:
         Which of all m stars these are.
     all_stars : ndarray of float64, shape (m, 2)
         The positions of all stars in the whole images.
+    penalty : Penalty
+        Of runs that are not smoothed more strongly near stars.
     """
 
     def __init__(self, setup: Setup, tick: Callable[[], object] = int) -> None:
@@ -120,7 +122,12 @@ class GuardedRuns:
         self._setup = replace(
             setup, solver="sgp", pad=pad, initial_extended=None, initial_star_fluxes=None
         )
-        self._smoothing = STEADY * recommend_smoothing(self.observation)
+        self.penalty = Penalty(smoothing=STEADY * recommend_smoothing(self.observation))
+
+    def setup_of(self, psfs: Psfs, stars: Array) -> Setup:
+        """Return the setup of a run with PSFs of the whole images and stars of the window."""
+        observation = self.seen_through(psfs)
+        return replace(self._setup, observation=observation, stars=inside(stars, observation))
 
     def fit(
         self,
@@ -149,13 +156,7 @@ class GuardedRuns:
         guard : float
             The weight of the smoothing near stars for that error, in the units of `GUARD`.
         """
-        observation = self.seen_through(psfs)
-        setup = replace(
-            self._setup,
-            observation=observation,
-            stars=inside(stars, observation),
-            refine_positions=moves,
-        )
+        setup = replace(self.setup_of(psfs, stars), refine_positions=moves)
         with ignored_warnings(), ignored_notes():  # those of the reconstruction are the same
             start = settle_halos(make_start(setup, Penalty()))
             found = _judged(start.estimate(), _unknown(error))
@@ -172,10 +173,8 @@ class GuardedRuns:
 
         Those given are returned where they stay. Stars stay unless they may move.
         """
-        observation = self.seen_through(psfs)
-        setup = replace(self._setup, observation=observation, stars=inside(stars, observation))
-        penalty = Penalty(smoothing=self._smoothing)
-        steps, found = settle_psfs(setup, penalty, moves, self._tick)
+        setup = self.setup_of(psfs, stars)
+        steps, found = settle_psfs(setup, self.penalty, moves, self._tick)
         whole = self._whole.replace(psfs=psfs)
         for step in steps:
             whole = with_errors(whole, step)
@@ -190,7 +189,7 @@ class GuardedRuns:
         """
         rings = found.misfit.in_rings
         near = smoothing_near_stars(found, found.model, rings, guard)
-        penalty = Penalty(smoothing=self._smoothing, near_stars=near)
+        penalty = replace(self.penalty, near_stars=near)
         setup = replace(
             setup,
             stars=inside(found.scene.places, self.observation),
