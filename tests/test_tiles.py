@@ -314,6 +314,7 @@ def test_one_tile_is_the_whole_bit_for_bit():
 
 
 JUDGED = {"engine": "numpy", "stop": None, "n_iter": 15, "pad": 2}
+JUDGED |= {"refine_psfs": ("jitter", "pixels")}
 
 
 @pytest.fixture(scope="module")
@@ -349,7 +350,7 @@ def test_stars_of_tiles_are_those_of_one_run_though_their_psf_is_wrong(narrow):
 @pytest.mark.exhaustive
 def test_families_that_are_named_are_fitted_before_tiles_are_cut(narrow):
     observation, stars, *_ = narrow
-    run = {**JUDGED, "refine_psfs": ["jitter"], "smoothing": 0.01}
+    run = {**JUDGED, "smoothing": 0.01}
     whole = lnocl.deconvolve(observation, stars, **run)
     found = lnocl.deconvolve_tiles(observation, stars, tile=44, **run)
     assert found.psf_refinement.parameters == whole.psf_refinement.parameters
@@ -583,6 +584,7 @@ def stpsf_file(oversample=1):
     return keywords | {"OVERSAMP": oversample}, psfs
 
 
+@pytest.mark.filterwarnings("ignore:the PSFs do not fit the stars, by 12 %")
 def test_a_grid_of_psfs_is_taken_tile_by_tile(tmp_path, monkeypatch, capsys):
     pytest.importorskip("photutils", reason="photutils is not installed")
     monkeypatch.chdir(tmp_path)
@@ -595,9 +597,9 @@ def test_a_grid_of_psfs_is_taken_tile_by_tile(tmp_path, monkeypatch, capsys):
     varied = lnocl.Observation(observation.images, PsfField(psfs, nodes), background=5.0)
     expected = lnocl.deconvolve_tiles(varied, stars, tile=80, pad=4, n_iter=5, **RUN)
     found = outcome("out.fits")
-    # The PSFs differ by 1e-16, and refined from there by 1e-6.
-    np.testing.assert_allclose(found["PRIMARY"], expected.extended, rtol=1e-3)
-    np.testing.assert_allclose(found["STARS"]["flux"], expected.star_fluxes, rtol=1e-5)
+    # The PSFs differ by 1e-16.
+    np.testing.assert_allclose(found["PRIMARY"], expected.extended, rtol=1e-8)
+    np.testing.assert_allclose(found["STARS"]["flux"], expected.star_fluxes, rtol=1e-11)
     assert cli.main([*words, "--overwrite", "--pad", "4"]) == 0  # without being told
 
 

@@ -44,7 +44,7 @@ def replicas(kind, parallel=False):
 
 def mends_psfs(kind):
     """PSFs of a core that is 8 % too narrow, which make the stars up to 7 % too faint."""
-    result = run(kind, xx=NARROW, n_iter=30, stop=None)
+    result = run(kind, xx=NARROW, n_iter=30, stop=None, refine_psfs=("jitter",))
     _, fluxes = observe(kind)
     found = result.psf_refinement
     assert found.is_accepted

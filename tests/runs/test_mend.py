@@ -1,4 +1,4 @@
-"""What the defaults do about PSFs and positions: nothing where they are right, else what mends."""
+"""What is done about PSFs and positions: nothing where they are right, else what mends."""
 
 from types import SimpleNamespace
 
@@ -21,7 +21,9 @@ PSF = (1.0 + R**2 / 6.0) ** -2.5
 PSF /= PSF.sum()
 SKY = 400.0 * np.exp(-((X - 30) ** 2) / 8.0 - ((Y - 36) / 8.0) ** 2)
 FLUX = 10.0 * SKY.sum()
+NOISE = np.random.default_rng(5).standard_normal(PSF.shape)
 RUN = {"engine": "numpy", "pad": 0, "n_iter": 200}
+REFINED = {"refine_psfs": ("jitter", "pixels")}
 
 
 def blurred(*values):
@@ -51,6 +53,15 @@ def test_right_psfs_and_positions_are_left(right):
     off = solve(refine_positions=False, refine_psfs=())
     np.testing.assert_array_equal(right.extended, off.extended)
     np.testing.assert_array_equal(right.star_fluxes, off.star_fluxes)
+
+
+@pytest.mark.parametrize(
+    "psf", [blurred(0.5, 0.0, 0.5), PSF + 1e-4 * NOISE], ids=["width", "noise"]
+)
+def test_psfs_that_are_exact_stay_though_they_do_not_fit(psf):
+    found = solve(given=psf)
+    np.testing.assert_array_equal(found.psfs[0], psf / psf.sum())
+    assert found.psf_refinement.psf_error > 0.01
 
 
 def test_a_star_beside_its_place_is_moved(caplog):
@@ -83,7 +94,7 @@ def few_counts(given, rms=0.0, claimed=0.0, flux=4000.0, size=48):
     image = (rng.poisson(means) + rng.normal(0.0, rms, (N, N)))[cut, cut]
     stars = np.array([(-5, 0), (5, 0)]) + size // 2
     observation = lnocl.Observation(image, given, background=LEVEL, read_noise=claimed)
-    found = lnocl.deconvolve(observation, stars, **RUN)
+    found = lnocl.deconvolve(observation, stars, **RUN, **REFINED)
     return found.star_fluxes / flux, getattr(found.psf_refinement, "is_accepted", False)
 
 
@@ -148,7 +159,7 @@ def test_free_pixels_are_refused_that_fit_in_part_or_change_a_flux_by_more_than_
 
 def test_a_wrong_width_is_mended(right):
     psf = blurred(0.5, 0.0, 0.5)
-    found = solve(psf)
+    found = solve(psf, **REFINED)
     assert found.psf_refinement.is_accepted
     assert np.linalg.norm(found.psfs[0] - psf) < 0.1 * np.linalg.norm(PSF - psf)
     assert found.star_fluxes == pytest.approx(FLUX, rel=0.01)
@@ -157,7 +168,7 @@ def test_a_wrong_width_is_mended(right):
 def test_a_width_a_little_wrong_is_seen_though_a_free_source_would_hide_it():
     """The extended source takes it up where nothing keeps it from the star."""
     psf = blurred(0.06, 0.0, 0.06)
-    found = solve(psf, sky=0.0 * SKY + 1.0)
+    found = solve(psf, sky=0.0 * SKY + 1.0, **REFINED)
     assert found.psf_refinement.is_accepted
     assert found.star_fluxes == pytest.approx(FLUX, rel=0.01)
 
@@ -169,7 +180,7 @@ class TestSpeckles:
     TRUE = TRUE / TRUE.sum()
 
     def test_free_pixels_mend_them_and_their_error_is_allowed_for_still(self):
-        found, left = solve(self.TRUE), solve(self.TRUE, refine_psfs=())
+        found, left = solve(self.TRUE, **REFINED), solve(self.TRUE)
         assert found.psf_refinement.is_accepted
         before, after = found.psf_refinement.misfit
         assert after < 0.2 * before
@@ -225,11 +236,11 @@ def test_psfs_of_many_stars_are_judged_only_where_that_is_asked(monkeypatch, cap
 
 
 def test_noise_is_taken_from_wings_that_are_negative():
-    noisy = PSF + 1e-4 * np.random.default_rng(5).standard_normal(PSF.shape)
-    found = solve(given=noisy)
+    noisy = PSF + 1e-4 * NOISE
+    found = solve(given=noisy, **REFINED)
     assert found.psfs.min() > -1e-9
     assert found.star_fluxes == pytest.approx(FLUX, rel=0.03)
-    kept = solve(given=noisy, refine_psfs=())
+    kept = solve(given=noisy)
     np.testing.assert_array_equal(kept.psfs[0], noisy / noisy.sum())
 
 

@@ -23,7 +23,7 @@ from lnocl.core.solvers.psf_errors import (
     ZERO_POINTS,
     slopes_of,
 )
-from lnocl.core.solvers.star_errors import LEFT, standard_errors
+from lnocl.core.solvers.star_errors import standard_errors
 
 N = 32
 Y, X = np.indices((N, N), float)
@@ -138,7 +138,6 @@ def dense(scene, sky, fluxes, moves):
     variances = np.linalg.inv(columns @ seen)
     change, variances = variances @ (left @ seen), np.diag(variances)
     of_fluxes, of_places = np.split(np.hypot(np.sqrt(variances), change), [n])
-    of_fluxes = np.hypot(of_fluxes, LEFT * scene.observation.psf_error * fluxes)
     of_places = of_places.reshape(-1, len(places)).T.repeat(scene.n_epochs, axis=0)
     return np.column_stack([of_fluxes, of_places])
 

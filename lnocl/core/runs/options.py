@@ -100,8 +100,8 @@ def check_families(
 ) -> tuple[str, ...]:
     """Return the families of PSFs that may be refined.
 
-    `positions` are those of stars that show them. "auto" stands for those that any star shows, or
-    for none where not all `is_auto`.
+    `positions` are those of stars that show them. "auto" stands for those that any star shows; for
+    none where PSFs are exact, or not all `is_auto`.
 
     Raises
     ------
@@ -111,7 +111,7 @@ def check_families(
         for beside free positions.
     """
     if isinstance(names, str) and names == "auto":
-        names = automatic_families(observation) if is_auto else ()
+        names = automatic_families(observation) if is_auto and observation.psf_error else ()
     if isinstance(names, str) or not isinstance(names, Iterable):
         raise InputError(
             f"`refine_psfs` is {names!r}; give auto, or a sequence of {', '.join(FAMILIES)}"

@@ -25,6 +25,7 @@ from lnocl.core.runs.psf_posterior import HELD
 from lnocl.core.runs.start import Setup
 from lnocl.core.scene.arrays import Array
 from lnocl.core.scene.cores import fwhm
+from lnocl.core.scene.fields import MOST_PSF_ERROR
 from lnocl.core.scene.observation import Observation
 from lnocl.core.scene.psf_families import PsfFamilies, PsfParameters
 from lnocl.core.scene.psf_faults import name_faults
@@ -96,7 +97,8 @@ def mend(
     The noise of PSFs is taken from their wings first. PSFs that may have an error then become the
     mean of what the stars show of it (`lnocl.core.runs.psf_posterior`), unless they fit worse so.
     Where they are off by no more than that error holds, neither jitter nor pixels are fitted
-    unasked, and stars take their marginal fluxes.
+    unasked, and stars take their marginal fluxes. Where they are off by more, the error is raised
+    at the end to what holds it.
 
     What does not fit then is mended: stars are moved, the families are fitted, and pixels freed.
     Each is tried only where the misfit before is in doubt. It is taken where it leaves less than
@@ -182,9 +184,12 @@ def mend(
     # Replicas draw PSFs from it, so that the errors of regions contain that of the PSFs.
     if not len(known) and len(scatter := allowance.scatter()):
         observation = observation.replace(psf_scatter=scatter)
-    changed = replace(setup, observation=observation, refine_positions=state.moves)
     fits = not allowance.error
     is_within = fits or _is_held(estimate.misfit, observation)
+    if observation.psf_error and not is_within:  # the errors of stars hold what residuals show
+        raised = min(estimate.misfit.kappa / HELD, MOST_PSF_ERROR)
+        observation = observation.replace(psf_error=raised)
+    changed = replace(setup, observation=observation, refine_positions=state.moves)
     return Mended(changed, refinement, near_stars, fits, is_within)
 
 
@@ -386,10 +391,11 @@ def _warn(refinement: PsfRefinement, setup: Setup) -> None:
             )
         )
     if not refinement.has_free_pixels and refinement.psf_error > NOTABLE:
+        are_exact = "" if setup.observation.psf_error else ", or leave `psf_error` 0 out"
         warn(
             f"the PSFs do not fit the stars, by {100 * refinement.psf_error:.2g} %: "
             + (
                 name_faults(setup.observation, seen)
-                or "trust nothing fainter than this near the stars"
+                or f"trust nothing fainter than this near the stars{are_exact}"
             )
         )

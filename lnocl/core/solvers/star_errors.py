@@ -32,9 +32,6 @@ from lnocl.core.solvers.near_star import NearStar, Surroundings
 
 # The share of the gradient at which conjugate gradients end.
 FINISHED = 1e-8
-# Of the relative error that PSFs may have in their width: what the linear least squares leave of it
-# in a flux (docs/validation/psf_error.md).
-LEFT = 1.0 / 6.0
 
 
 def standard_errors(
@@ -75,8 +72,6 @@ def standard_errors(
         there = range(first, first + n_epochs)
         errors[first : first + n_epochs, :k] = _errors_of(near, np.isin(near.held, there), levels)
     errors[:, 0] *= scene.unit
-    left = LEFT * scene.observation.psf_error * estimate.star_fluxes[: scene.n_stars]
-    errors[:, 0] = np.hypot(errors[:, 0], left)
     return errors
 
 
