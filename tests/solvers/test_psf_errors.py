@@ -207,7 +207,7 @@ def test_light_beyond_a_file_is_an_unknown_where_images_are_larger():
     estimate = scene_of(cut, psf_error=0.03)
     view = View(estimate.scene, 0)
     slopes, _ = PsfErrors(estimate, [view] * 3, {}).slopes(0, view.model(estimate))
-    beyond = slopes[N_SLOPES - 1]
+    beyond = slopes[N_SLOPES - 2]
     light = estimate.scene.star_field.light(0, estimate.fluxes)
     inside = light > 0.05 * light.max()
     np.testing.assert_allclose(beyond[inside], -missing * light[inside], rtol=0.2)
@@ -216,7 +216,22 @@ def test_light_beyond_a_file_is_an_unknown_where_images_are_larger():
     estimate = scene_of(as_large, psf_error=0.03)
     view = View(estimate.scene, 0)
     slopes, _ = PsfErrors(estimate, [view] * 3, {}).slopes(0, view.model(estimate))
-    assert not slopes[N_SLOPES - 1].any()
+    assert not slopes[N_SLOPES - 2].any()
+
+
+def test_a_level_of_a_file_is_an_unknown_as_bright_as_its_border():
+    share, clean = 0.04, lopsided(2.0, 41)
+    estimate = scene_of((1 - share) * clean + share / clean.size, psf_error=0.03)
+    view = View(estimate.scene, 0)
+    slopes, _ = PsfErrors(estimate, [view] * 3, {}).slopes(0, view.model(estimate))
+    with_it, without = (
+        each.scene.star_field.light(0, estimate.fluxes)
+        for each in (estimate, scene_of(clean, psf_error=0.03))
+    )
+    expected = (1 - share) * (with_it - without)
+    found, most = slopes[N_SLOPES - 1], abs(expected).max()
+    np.testing.assert_allclose(found, expected, rtol=0, atol=5e-3 * most)
+    assert found[0, 0] == pytest.approx(expected[0, 0], rel=0.05)  # far from both stars
 
 
 class TestPixels:

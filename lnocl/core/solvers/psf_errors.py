@@ -5,10 +5,11 @@ Every real PSF K_j is a little wrong. What the images have is taken to be
 .. math:: K_j + \sum_k \theta_k L_{jk} + D_j, \qquad \theta_k \sim N(0, 1),
 
 with the derivatives L of K_j (`slopes_of`), each times the standard deviation of its prior, light
-beyond its file among them (`lnocl.core.scene.psf_edge`), and the errors D_j of its pixels, in
-proportion to the PSF (`PixelErrors`). Images with the same PSF have the same theta, and those of
-two PSFs are correlated, as PSFs of one set err together. Where several images are of one epoch,
-each has a zero point besides: the light that it has of all sources, relative to the others.
+beyond its file and a level of it among them (`lnocl.core.scene.psf_edge`), and the errors D_j of
+its pixels, in proportion to the PSF (`PixelErrors`). Images with the same PSF have the same theta,
+and those of two PSFs are correlated, as PSFs of one set err together. Where several images are of
+one epoch, each has a zero point besides: the light that it has of all sources, relative to the
+others.
 
 `lnocl.Observation` has the priors as `psf_error`, the standard deviation of the relative width.
 Light outside the stars is taken through the PSF as it is.
@@ -36,8 +37,8 @@ from lnocl.core.scene.transforms import enlarged
 from lnocl.core.scene.view import View
 
 # The derivatives: by a stretch and a blur along x, across and along y each, by wings, by a shift,
-# by the light beyond the file.
-N_SLOPES, N_SHAPES = 10, 6
+# by the light beyond the file, by a level of it.
+N_SLOPES, N_SHAPES = 11, 6
 # Standard deviations over that of the width: of the errors of pixels, relative to the PSF smoothed,
 # of zero points, of a shift and of the width of the Lorentzian of wings, both in widths of the PSF.
 PIXELS, ZERO_POINTS, SHIFT, WINGS = 0.67, 0.67, 0.5, 0.3
@@ -74,7 +75,7 @@ def slopes_of(psf: Array, error: float) -> Array:
 
     Returns
     -------
-    ndarray of float64, shape (N_SLOPES - 1, ky, kx)
+    ndarray of float64, shape (N_SLOPES - 2, ky, kx)
         By a stretch along x, across and along y, by a blur likewise, by wings, and by a shift along
         x and y.
     """
@@ -205,20 +206,24 @@ class PsfErrors:
     def _changed_near(self, j: int, psf: Array) -> Array:
         """Return the part of a PSF that a star in the window may light, and it with each slope.
 
-        Light beyond the file has the standard deviation that the edge of the PSF tells. It counts
-        where images are larger than the file.
+        Light beyond the file, which counts where images are larger, has the standard deviation that
+        the edge of the PSF tells. A level of all pixels has that of its border, which it is part
+        of.
         """
         scene, (ny, nx) = self._estimate.scene, self._views[j].window.shape
         most = 2 * scene.oversample * ny, 2 * scene.oversample * nx
         shape = min(psf.shape[0], most[0]), min(psf.shape[1], most[1])
         near = enlarged(psf, shape, is_centred=True)
         slopes = [enlarged(each, most, is_centred=True) for each in slopes_of(near, self._error)]
-        own, beyond = enlarged(psf, most, is_centred=True), np.zeros(most)
+        own, (beyond, level) = enlarged(psf, most, is_centred=True), np.zeros((2, *most))
         light, images = float(psf.sum()), scene.oversample * np.array(scene.observation.shape)
-        if light > 0 and (psf.shape < images).any():
-            edge = psf_edge(psf / light)
-            beyond = light * edge.wing(most) - edge.light * own
-        return own + np.array([np.zeros(most), *slopes, beyond])
+        if light > 0:
+            flat = enlarged(np.ones(psf.shape), most, is_centred=True)
+            level = _on_border(psf) * (flat - psf.size / light * own)
+            if (psf.shape < images).any():
+                edge = psf_edge(psf / light)
+                beyond = light * edge.wing(most) - edge.light * own
+        return own + np.array([np.zeros(most), *slopes, beyond, level])
 
     def _of_stars(self, j: int, name: str, make: Callable[[Array], Array], n: int = 1) -> Array:
         """Return what the stars in a window show through n arrays that are made of their PSFs."""
@@ -233,6 +238,11 @@ class PsfErrors:
                 for image, each in zip(seen, self._made[key], strict=True):
                     image += self._estimate.fluxes[s] * view.cut(each.at(*field.places[j][s]))
         return seen
+
+
+def _on_border(psf: Array) -> float:
+    """Return the mean of the outermost pixels of a PSF."""
+    return float(np.mean([*psf[0], *psf[-1], *psf[1:-1, 0], *psf[1:-1, -1]]))
 
 
 def _instead(scatter: Array, psf: Array) -> Array:
