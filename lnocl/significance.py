@@ -16,9 +16,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from lnocl.core.runs.companions import Companion, companions
 from lnocl.core.runs.outcome import Outcome
 from lnocl.core.scene.arrays import Array, number_in, whole
 from lnocl.core.scene.detector import on_sky
+from lnocl.core.scene.estimate import Estimate
 from lnocl.core.scene.quantities import in_unit
 from lnocl.core.scene.texture import SHARE_NEAR
 from lnocl.core.solvers.halos import halo_errors
@@ -39,6 +41,8 @@ CLEAR = 3.0
 NEAR = 0.7
 # Error of a place between pixels, pixels of the sky.
 INTERPOLATED = 0.02
+# Companions are looked for in so many rings round a star.
+FARTHEST = 3
 # Of more false alarms in a field the number is not what the threshold says.
 MOST_ALARMS = 10.0
 # The threshold of fewer is beyond what numbers hold.
@@ -46,13 +50,30 @@ FEWEST_ALARMS = 1e-200
 POINT_SOURCE, EXTENDED = "point", "extended"
 
 
-def null_of(outcome: Outcome) -> Null:
-    """Return the model of a reconstruction without sources beside its stars."""
+def null_of(outcome: Outcome, estimate: Estimate | None = None) -> Null:
+    """Return the model of a reconstruction without sources beside its stars, or those of another.
+
+    That is the reconstruction's `estimate` with further stars.
+    """
     refinement = outcome.psf_refinement
     errors = np.zeros(1), np.zeros(0)
     if refinement is not None and refinement.psf_error:
         errors = refinement.edges, refinement.errors_in_rings
-    return Null(outcome.estimate, outcome.moves, errors)
+    return Null(estimate or outcome.estimate, outcome.moves, errors)
+
+
+def _beside_stars(outcome: Outcome, null: Null, found: ScoreMap) -> tuple[Null, list[Companion]]:
+    """Return companions, and the model that has them as stars; `null` where there are none.
+
+    A companion scatters the ring that it lies in, and hides so from a map. They are looked for
+    where a place near a star has more than counts scatter.
+    """
+    is_near = found.score.is_tested & (null.rings <= FARTHEST)
+    if found.width or not outcome.scene.n_stars or not (found.score.values[is_near] > CLEAR).any():
+        return null, []
+
+    estimate, beside = companions(outcome.estimate)
+    return (null_of(outcome, estimate) if beside else null), beside
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,7 +111,13 @@ class Significance:
     A source is "extended" where two things hold. There is light round it, between 0.85 and 1.65
     resolutions. And a point is fitted together with an extended source as bright as that light
     (`lnocl.detection.point_test`), and has less than three errors. All sources wider than a point
-    are "extended". How often noise alone raises an alarm was measured:
+    are "extended".
+
+    A companion scatters the ring round its star that it lies in, as an error of the PSF does, and
+    hides so, the brighter the more. Where a place within three resolutions of a star has three
+    standard deviations of the counts, points are tried there against all that the PSF may have
+    wrong (`lnocl.core.runs.companions`). Those found are detections, with the errors of that fit,
+    and stars in the map. How often noise alone raises an alarm was measured:
     :doc:`/validation/detections`.
 
     Examples
@@ -387,6 +414,9 @@ def significance(outcome: Outcome, width: float, false_alarms: float) -> Signifi
     observation = outcome.observation
     null = null_of(outcome)
     found = ScoreMap(null, width * observation.oversample)
+    with_companions, beside = _beside_stars(outcome, null, found)
+    if beside:
+        null, found = with_companions, ScoreMap(with_companions, 0.0)
     ny, nx = observation.sky_shape
     if not found.score.is_tested[:ny, :nx].any():
         raise InputError(
@@ -402,7 +432,7 @@ def significance(outcome: Outcome, width: float, false_alarms: float) -> Signifi
         false_alarms,
         width,
         null.resolution / observation.oversample,
-        _detections(outcome, null, found, least),
+        _detections(outcome, null, found, least, beside),
         null,
         found,
         outcome,
@@ -441,7 +471,9 @@ def check_injections(n: object, seed: object) -> None:
     whole("seed", seed, 0)
 
 
-def _detections(outcome: Outcome, null: Null, found: ScoreMap, least: float) -> QTable:
+def _detections(
+    outcome: Outcome, null: Null, found: ScoreMap, least: float, beside: Sequence[Companion]
+) -> QTable:
     from astropy.table import QTable
     from astropy.units import electron, pix
     from scipy.spatial import KDTree
@@ -470,9 +502,16 @@ def _detections(outcome: Outcome, null: Null, found: ScoreMap, least: float) -> 
     spread = np.sqrt(np.diagonal(np.linalg.inv(curvature), axis1=1, axis2=2))[:, ::-1]
     ratio = np.maximum(found.fluxes[at] / found.errors[at], 1.0)
     moved = np.hypot(spread / ratio[:, None], INTERPOLATED) / q
+    beside = [each for each in beside if each.significance > least]
+    pixels = np.concatenate([pixels, np.reshape([each.place for each in beside], (-1, 2))])
+    fluxes = np.append(fluxes, [each.flux for each in beside])
+    errors = np.append(errors, [each.errors[0] for each in beside])
+    moved = np.concatenate([moved, np.reshape([each.errors[1:] for each in beside], (-1, 2))])
+    gaussian = np.append(gaussian, [each.significance for each in beside])
+    kinds = np.append(kinds, [POINT_SOURCE] * len(beside))
     stars = scene.stars[:: outcome.observation.n_epochs]
     distance, nearest = KDTree(stars).query(pixels)
-    return QTable(
+    table = QTable(
         {
             "x": pixels[:, 0] * pix,
             "y": pixels[:, 1] * pix,
@@ -486,3 +525,4 @@ def _detections(outcome: Outcome, null: Null, found: ScoreMap, least: float) -> 
             "kind": kinds,
         }
     )
+    return table[np.argsort(-table["significance"], kind="stable")]

@@ -65,6 +65,23 @@ def near(table, x, y, reach=1.5):
     return table[np.hypot(table["x"].value - x, table["y"].value - y) < reach]
 
 
+@pytest.mark.parametrize(("distance", "flux"), [(1.1, 2e4), (1.5, 6e3)])
+def test_companions_are_found_once_whose_ring_they_scatter(distance, flux):
+    """Taken for an error of the PSF, the brighter the more, they had 0.5 of their light or none."""
+    away = distance * 3.6 * np.array([0.6, -0.8])
+    light = point(*STAR, 2e5) + point(*(STAR + away), flux)
+    found = solve(light, [STAR], n_iter=60, smoothing=0.003).significance()
+    [source] = found.detections
+    assert source["kind"] == "point"
+    assert source["significance"] > 10
+    assert abs(source["flux"].value - flux) < 3 * source["flux_error"].value
+    assert source["flux_error"].value < flux / 4
+    for axis, at in zip(("x", "y"), STAR + away, strict=True):
+        assert abs(source[axis].value - at) < 3 * source[f"{axis}_error"].value
+        assert source[f"{axis}_error"].value < 0.3
+    assert source["distance"].value == pytest.approx(distance * 3.6, abs=0.5)
+
+
 @pytest.mark.parametrize(("x", "y", "flux"), [(52.4, 40.2, 2000), (12.7, 12.2, 700)])
 def test_points_are_found_with_their_fluxes_and_places(found, x, y, flux):
     [source] = near(found.detections, x, y)

@@ -18,10 +18,11 @@ has to stand against that and the PSF's error together (`lnocl.core.solvers.near
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from copy import copy
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -58,6 +59,28 @@ FINISHED, FREE = 1e-3, 1e-9
 N_ITER = 300
 
 
+class Companion(NamedTuple):
+    """A point beside a star.
+
+    Attributes
+    ----------
+    place : ndarray of float64, shape (2,)
+        (x, y), pixels of the images.
+    flux : float
+        Electrons.
+    errors : ndarray of float64, shape (3,)
+        Standard errors of flux, x and y.
+    significance : float
+        By how many standard errors it is brighter than the mirrored place, beside all that the PSF
+        may have wrong.
+    """
+
+    place: Array
+    flux: float
+    errors: Array
+    significance: float
+
+
 def beside_stars(setup: Setup, tick: Callable[[], object] = int) -> Array:
     """Return the places of `companions`, those that a run of a window round the stars shows.
 
@@ -73,8 +96,9 @@ def beside_stars(setup: Setup, tick: Callable[[], object] = int) -> Array:
     near = replace(near, refine_positions=False)
     with suppress(DivergedError, NotFiniteError), ignored_warnings(), ignored_notes():
         start = settle_halos(make_start(near, runs.penalty))
-        found = companions(run_steadily(start, runs.penalty, N_ITER, tick).estimate)
-        places = found + (runs.all_stars[runs.held][0] - runs.stars[0])
+        _, found = companions(run_steadily(start, runs.penalty, N_ITER, tick).estimate)
+        offset = runs.all_stars[runs.held][0] - runs.stars[0]
+        places = np.reshape([each.place + offset for each in found], (-1, 2))
     if len(places):
         named = " ".join(f"({x:.4g}, {y:.4g})" for x, y in places)
         number = counted(len(places), "point")
@@ -82,39 +106,38 @@ def beside_stars(setup: Setup, tick: Callable[[], object] = int) -> Array:
     return places
 
 
-def companions(estimate: Estimate) -> Array:
-    """Return the places of points that are to be held as stars while PSFs are fitted, (n, 2).
-
-    They are (x, y), pixels of the images.
+def companions(estimate: Estimate) -> tuple[Estimate, list[Companion]]:
+    """Return points beside the stars, and the estimate that has them as stars too.
 
     Parameters
     ----------
     estimate : Estimate
-        That of a run with the PSFs as they are given, and with the stars that are known.
+        That of a run with the stars that are known.
     """
-    scene, places = copy(estimate.scene), list[Array]()
+    scene, found = copy(estimate.scene), list[Companion]()
     error = max(scene.observation.psf_error, PSF_ERROR)  # those that are fitted are doubted
     scene.observation = scene.observation.replace(psf_error=error)
     estimate = Estimate(scene, estimate.sky, estimate.star_fluxes)
     light = estimate.star_fluxes[: scene.n_stars].reshape(-1, scene.n_epochs).sum(axis=1)
     brightest = np.argsort(-light, kind="stable")[:MOST_STARS]
     stars = (scene.n_epochs * brightest[light[brightest] > 0]).tolist()
-    while stars and len(places) < MOST_POINTS:
-        around = Surroundings(estimate, False)
+    beside = estimate
+    while stars and len(found) < MOST_POINTS:
+        around = Surroundings(beside, False)
         if around.width < NARROWEST:  # samples do not hold its shape
             break
-        likeliest = (_likeliest(around, star) for star in stars)
-        errors, place, flux = max(likeliest, key=lambda each: each[0])
-        found = _with_point(estimate, place, flux) if errors > SIGNIFICANT else None
-        if found is None:
+        likeliest = max((_likeliest(around, star) for star in stars), key=lambda each: each[-1])
+        if likeliest.significance <= SIGNIFICANT:
             break
-        estimate = found
-        places.append(estimate.scene.stars[-1])
-    return np.reshape(places, (-1, 2))
+        tried = _with_points(estimate, [*found, likeliest])
+        if tried is None:
+            break
+        beside, found = tried
+    return beside, found
 
 
-def _likeliest(around: Surroundings, star: int) -> tuple[float, Array, float]:
-    """Return how many errors the likeliest point beside a star has, its place and its flux."""
+def _likeliest(around: Surroundings, star: int) -> Companion:
+    """Return the likeliest point beside a star, its errors not known."""
     near, scene = NearStar(around, star, FINISHED), around.scene
     rows, columns = offsets_from(scene, star, near.window)
     distance = np.hypot(rows, columns) / near.resolution
@@ -124,7 +147,7 @@ def _likeliest(around: Surroundings, star: int) -> tuple[float, Array, float]:
     is_tried[::step, ::step] = True
     y, x = np.nonzero(is_tried & is_allowed)
     if not len(y):
-        return -np.inf, scene.stars[star], 0.0
+        return Companion(scene.stars[star], 0.0, np.zeros(3), -np.inf)
     fluxes, errors = _points(near, around.estimate, (y, x))
     away = np.stack([columns[x], rows[y, 0]], axis=1)
     _, opposite = KDTree(away).query(-away)
@@ -136,7 +159,8 @@ def _likeliest(around: Surroundings, star: int) -> tuple[float, Array, float]:
     fluxes, errors = _points(near, around.estimate, (y, x))
     at = int(np.argmax(fluxes / errors))
     place = scene.stars[star] + np.array([columns[x[at]], rows[y[at], 0]]) / scene.oversample
-    return float(one_sided[best]), place, float(fluxes[at]) * scene.unit
+    flux = max(float(fluxes[at]) * scene.unit, 0.0)
+    return Companion(place, flux, np.zeros(3), float(one_sided[best]))
 
 
 def _points(
@@ -177,28 +201,57 @@ def _points(
     return fluxes, errors
 
 
-def _with_point(estimate: Estimate, place: Array, flux: float) -> Estimate | None:
-    """Return the estimate with a point instead of what it holds there; None where it has none."""
+def _with_points(
+    estimate: Estimate, points: Sequence[Companion]
+) -> tuple[Estimate, list[Companion]] | None:
+    """Return the estimate with points instead of what it holds there, and the points as they fit.
+
+    None where one of them is not clear, or has come too near to a star.
+    """
+    fitted, width = list(points), Surroundings(estimate, False).width
     n, n_epochs = estimate.scene.n_stars, estimate.scene.n_epochs
-    width = Surroundings(estimate, False).width
-    fluxes = np.insert(estimate.star_fluxes, n, [max(flux, 0.0)] * n_epochs)
-    for _ in range(N_STEPS):
-        scene = estimate.scene.with_star(place)
-        without = Texture(estimate.sky, on_sky(place[None], scene.oversample), width).mean
-        near = NearStar(Surroundings(Estimate(scene, without, fluxes), True), n, FINISHED)
-        at = near.unknowns[np.isin(near.held, np.arange(n, n + n_epochs))]
-        at = at[np.isfinite(variances(near.fit.information)[at]).all(axis=1)]
-        if not len(at):
+    for k in [*range(len(points))] * N_STEPS:
+        now = _holding(estimate, fitted, width)
+        point = _fitted(now, n + k * n_epochs, fitted[k])
+        if point is None:
             return None
-        change, _ = near.fit.solve()
-        values = fluxes[n] + change[at[:, 0]] * scene.unit
-        weights = 1.0 / near.fit.variances(at[:, 0]) / scene.unit**2
-        value = float((weights * values).sum() / weights.sum())
-        if value <= 0:
-            return None
-        place = place + change[at[0, 1:]].clip(-MOVED, MOVED)
-        fluxes[n : n + n_epochs] = value
-    away = np.hypot(*(place - estimate.scene.stars).T) * scene.oversample / width
-    if value * weights.sum() ** 0.5 < CLEAR or (away < NEAREST).any():
+        fitted[k] = point
+    away = [np.hypot(*(each.place - estimate.scene.stars).T).min() for each in fitted]
+    if min(away) * estimate.scene.oversample < NEAREST * width:
         return None
-    return Estimate(estimate.scene.with_star(place), without, fluxes)
+    if any(each.flux < CLEAR * each.errors[0] for each in fitted):
+        return None
+    return _holding(estimate, fitted, width), fitted
+
+
+def _holding(estimate: Estimate, points: Sequence[Companion], width: float) -> Estimate:
+    """Return an estimate that has points as stars, instead of what it holds there."""
+    scene, n_epochs = estimate.scene, estimate.scene.n_epochs
+    places = np.array([each.place for each in points])
+    without = Texture(estimate.sky, on_sky(places, scene.oversample), width).mean
+    added = np.repeat([each.flux for each in points], n_epochs)
+    fluxes = np.insert(estimate.star_fluxes, [scene.n_stars] * len(added), added)
+    for place in places:
+        scene = scene.with_star(place)
+    return Estimate(scene, without, fluxes)
+
+
+def _fitted(estimate: Estimate, first: int, point: Companion) -> Companion | None:
+    """Return a point, the star `first`, after a step to where it fits; None where it has no light.
+
+    Its flux is the mean over epochs.
+    """
+    near = NearStar(Surroundings(estimate, True), first, FINISHED)
+    there = np.arange(first, first + estimate.scene.n_epochs)
+    at = near.unknowns[np.isin(near.held, there)]
+    at = at[np.isfinite(variances(near.fit.information)[at]).all(axis=1)]
+    if not len(at):
+        return None
+    change, _ = near.fit.solve()
+    unit = estimate.scene.unit
+    values = point.flux + change[at[:, 0]] * unit
+    weights = 1.0 / near.fit.variances(at[:, 0]) / unit**2
+    flux = float((weights * values).sum() / weights.sum())
+    place = point.place + change[at[0, 1:]].clip(-MOVED, MOVED)
+    errors = [weights.sum() ** -0.5, *np.sqrt(near.fit.variances(at[0, 1:]))]
+    return Companion(place, flux, np.array(errors), point.significance) if flux > 0 else None
