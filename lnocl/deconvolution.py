@@ -300,7 +300,7 @@ def deconvolve(
     Where their chi squared exceeds its expectation by five standard deviations, or by three and the
     error is above 0.025, positions and PSFs are refined as far as they may be: exact PSFs only
     where that is asked, and jitter and pixels unasked only where the error is above twice
-    `psf_error`, which is raised to half of it. They are used where they take two standard
+    `psf_error`, which is raised to it. They are used where they take two standard
     deviations or more, and leave less than half of the error, or nothing that noise does not
     explain. Free pixels, which may fit anything, are used where they leave less
     than 0.3 of it, and change no star's flux by more than κ. Read noise that is larger than the

@@ -230,5 +230,5 @@ def test_jitter_and_pixels_are_fitted_and_fluxes_not_marginal_beyond_what_is_hel
     assert not found.fits
     assert 0.06 < found.refinement.psf_error < 0.1
     assert bool(found.refinement.parameters) != is_within
-    raised = error if is_within else found.refinement.psf_error / 2
+    raised = error if is_within else found.refinement.psf_error
     assert found.setup.observation.psf_error == pytest.approx(raised)

@@ -138,6 +138,7 @@ def dense(scene, sky, fluxes, moves):
     variances = np.linalg.inv(columns @ seen)
     change, variances = variances @ (left @ seen), np.diag(variances)
     of_fluxes, of_places = np.split(np.hypot(np.sqrt(variances), change), [n])
+    of_fluxes = np.hypot(of_fluxes, scene.observation.psf_error**2 * fluxes)
     of_places = of_places.reshape(-1, len(places)).T.repeat(scene.n_epochs, axis=0)
     return np.column_stack([of_fluxes, of_places])
 

@@ -187,7 +187,7 @@ def mend(
     fits = not allowance.error
     is_within = fits or _is_held(estimate.misfit, observation)
     if observation.psf_error and not is_within:  # the errors of stars hold what residuals show
-        raised = min(estimate.misfit.kappa / HELD, MOST_PSF_ERROR)
+        raised = min(estimate.misfit.kappa, MOST_PSF_ERROR)
         observation = observation.replace(psf_error=raised)
     changed = replace(setup, observation=observation, refine_positions=state.moves)
     return Mended(changed, refinement, near_stars, fits, is_within)

@@ -15,7 +15,9 @@ conjugate gradients, in a window round each star (`lnocl.core.solvers.near_star`
 A level of the background that is not known adds the square of what it changes in a star.
 
 The same least squares tell how far a star is from where they are least, as the extended source is
-not where it is expected or iterations have ended early. The square of that is added.
+not where it is expected or iterations have ended early. The square of that is added. So is the
+square of what is of second order in the error e of PSFs, the share e^2 of a flux
+(docs/validation/psf_error.md).
 """
 
 from __future__ import annotations
@@ -72,6 +74,8 @@ def standard_errors(
         there = range(first, first + n_epochs)
         errors[first : first + n_epochs, :k] = _errors_of(near, np.isin(near.held, there), levels)
     errors[:, 0] *= scene.unit
+    second_order = scene.observation.psf_error**2 * estimate.star_fluxes[: scene.n_stars]
+    errors[:, 0] = np.hypot(errors[:, 0], second_order)
     return errors
 
 
