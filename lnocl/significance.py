@@ -27,6 +27,7 @@ from lnocl.core.solvers.halos import halo_errors
 from lnocl.detection.point_test import point_flux
 from lnocl.detection.score import Null
 from lnocl.detection.score_map import ScoreMap
+from lnocl.detection.score_noise import MANY
 from lnocl.errors import InputError
 from lnocl.plotting.significance import SignificanceView, draw_significance
 
@@ -41,8 +42,8 @@ CLEAR = 3.0
 NEAR = 0.7
 # Error of a place between pixels, pixels of the sky.
 INTERPOLATED = 0.02
-# Companions are looked for in so many rings round a star.
-FARTHEST = 3
+# Companions are looked for in so many rings round a star, and at so many of the highest maxima.
+FARTHEST, MOST_LIKELY = 3, 4
 # Of more false alarms in a field the number is not what the threshold says.
 MOST_ALARMS = 10.0
 # The threshold of fewer is beyond what numbers hold.
@@ -62,18 +63,32 @@ def null_of(outcome: Outcome, estimate: Estimate | None = None) -> Null:
     return Null(estimate or outcome.estimate, outcome.moves, errors)
 
 
-def _beside_stars(outcome: Outcome, null: Null, found: ScoreMap) -> tuple[Null, list[Companion]]:
-    """Return companions, and the model that has them as stars; `null` where there are none.
+def _beside_stars(
+    outcome: Outcome, null: Null, found: ScoreMap, least: float
+) -> tuple[Estimate, list[Companion]]:
+    """Return companions, and the estimate that has them as stars.
 
-    A companion scatters the ring that it lies in, and hides so from a map. They are looked for
-    where a place near a star has more than counts scatter.
+    A companion scatters the ring that it lies in, and hides so from a map, or has a maximum of it
+    beside its place. So points are tried where a place near a star has more than counts scatter,
+    and at maxima where errors of PSFs may matter.
     """
-    is_near = found.score.is_tested & (null.rings <= FARTHEST)
-    if found.width or not outcome.scene.n_stars or not (found.score.values[is_near] > CLEAR).any():
-        return null, []
-
-    estimate, beside = companions(outcome.estimate)
-    return (null_of(outcome, estimate) if beside else null), beside
+    score, q = found.score, outcome.observation.oversample
+    if found.width or not outcome.scene.n_stars:
+        return outcome.estimate, []
+    is_near = score.is_tested & (null.rings < FARTHEST)
+    places, _, gaussian = found.maxima(least)
+    x, y = np.round(places).astype(int).T
+    rows, columns = score.values.shape
+    at = y % rows, x % columns
+    may_err = found.noise.degrees[at] < MANY
+    if not may_err.any() and not (score.values[is_near] > CLEAR).any():
+        return outcome.estimate, []
+    pixels, fluxes = (places - (q - 1) / 2.0) / q, found.peak_fluxes(*at)
+    likely = [
+        Companion(pixels[i], float(fluxes[i]), np.zeros(3), float(gaussian[i]))
+        for i in np.flatnonzero(may_err)[:MOST_LIKELY]
+    ]
+    return companions(outcome.estimate, likely)
 
 
 @dataclass(frozen=True, eq=False)
@@ -414,16 +429,18 @@ def significance(outcome: Outcome, width: float, false_alarms: float) -> Signifi
     observation = outcome.observation
     null = null_of(outcome)
     found = ScoreMap(null, width * observation.oversample)
-    with_companions, beside = _beside_stars(outcome, null, found)
+    least = found.threshold(false_alarms)
+    estimate, beside = _beside_stars(outcome, null, found, least)
     if beside:
-        null, found = with_companions, ScoreMap(with_companions, 0.0)
+        null = null_of(outcome, estimate)
+        found = ScoreMap(null, 0.0)
+        least = found.threshold(false_alarms)
     ny, nx = observation.sky_shape
     if not found.score.is_tested[:ny, :nx].any():
         raise InputError(
             f"nowhere do the images tell a source of `width` {width:g} pixels from stars, the "
             "level of the sky and edges: give a narrower one, or a larger field"
         )
-    least = found.threshold(false_alarms)
     return Significance(
         found.significance[:ny, :nx],
         found.fluxes[:ny, :nx],

@@ -7,7 +7,7 @@ import pytest
 
 import lnocl
 from lnocl.core.runs import companions as room
-from lnocl.core.runs.companions import companions
+from lnocl.core.runs.companions import Companion, companions
 from lnocl.core.scene.estimate import Estimate
 from lnocl.core.scene.forward_model import Model
 from lnocl.core.scene.scene import Scene
@@ -62,6 +62,22 @@ def test_points_are_found_where_they_are_though_psfs_are_wrong(wrong):
         assert max(errors) < 0.3
         assert abs(point.flux - flux) < 3 * flux_error
         assert flux_error < flux / 3
+
+
+def test_a_point_that_is_likely_farther_off_is_taken_where_it_fits():
+    place, flux = np.array([37.8, 19.2]), 1e4  # 4.5 widths
+    observation = observe({tuple(place): flux}, wrong=1.03)
+    estimate, found = companions(start(observation))
+    assert not found
+    assert estimate.scene.n_stars == 1
+    beside = Companion(place + (0.7, -0.5), 0.7 * flux, np.zeros(3), 9.0)
+    none = Companion(np.array([9.0, 30.0]), 0.1 * flux, np.zeros(3), 8.0)
+    with_it, [point] = companions(estimate, [beside, none, beside])
+    assert with_it.scene.n_stars == 2
+    assert (abs(point.place - place) < 3 * point.errors[1:]).all()
+    assert abs(point.flux - flux) < 3 * point.errors[0]
+    assert point.errors[0] < 0.1 * flux
+    assert point.significance == 9.0
 
 
 def light(values):

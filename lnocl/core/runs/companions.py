@@ -106,13 +106,17 @@ def beside_stars(setup: Setup, tick: Callable[[], object] = int) -> Array:
     return places
 
 
-def companions(estimate: Estimate) -> tuple[Estimate, list[Companion]]:
+def companions(
+    estimate: Estimate, likely: Sequence[Companion] = ()
+) -> tuple[Estimate, list[Companion]]:
     """Return points beside the stars, and the estimate that has them as stars too.
 
     Parameters
     ----------
     estimate : Estimate
         That of a run with the stars that are known.
+    likely : sequence of Companion
+        Further points to try then, the likeliest first; their errors need not be known.
     """
     scene, found = copy(estimate.scene), list[Companion]()
     error = max(scene.observation.psf_error, PSF_ERROR)  # those that are fitted are doubted
@@ -133,6 +137,11 @@ def companions(estimate: Estimate) -> tuple[Estimate, list[Companion]]:
         if tried is None:
             break
         beside, found = tried
+    for point in likely:
+        width = NEAREST * Surroundings(estimate, False).width / scene.oversample
+        is_new = all(np.hypot(*(point.place - each.place)) > width for each in found)
+        if is_new and (tried := _with_points(estimate, [*found, point])):
+            beside, found = tried
     return beside, found
 
 
