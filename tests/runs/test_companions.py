@@ -70,7 +70,7 @@ def test_a_point_that_is_likely_farther_off_is_taken_where_it_fits():
     estimate, found = companions(start(observation))
     assert not found
     assert estimate.scene.n_stars == 1
-    beside = Companion(place + (0.7, -0.5), 0.7 * flux, np.zeros(3), 9.0)
+    beside = Companion(np.add(place, (0.7, -0.5)), 0.7 * flux, np.zeros(3), 9.0)
     none = Companion(np.array([9.0, 30.0]), 0.1 * flux, np.zeros(3), 8.0)
     with_it, [point] = companions(estimate, [beside, none, beside])
     assert with_it.scene.n_stars == 2
