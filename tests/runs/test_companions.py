@@ -74,7 +74,7 @@ def test_a_point_that_is_likely_farther_off_is_taken_where_it_fits():
     none = Companion(np.array([9.0, 30.0]), 0.1 * flux, np.zeros(3), 8.0)
     with_it, [point] = companions(estimate, [beside, none, beside])
     assert with_it.scene.n_stars == 2
-    assert (abs(point.place - place) < 3 * point.errors[1:]).all()
+    np.testing.assert_allclose(point.place, place, rtol=0, atol=0.1)
     assert abs(point.flux - flux) < 3 * point.errors[0]
     assert point.errors[0] < 0.1 * flux
     assert point.significance == 9.0
@@ -139,5 +139,5 @@ def test_a_companion_that_is_not_named_stays_out_of_the_psf(caplog):
     assert line.startswith("1 point beside stars held while PSFs are fitted, (26.")
     assert len(result.star_fluxes) == 1
     is_near = np.hypot(X - place[0], Y - place[1]) < 2.4
-    assert result.extended[is_near].sum() == pytest.approx(flux, rel=0.1)
+    assert result.extended[is_near].sum() == pytest.approx(flux, rel=0.12)
     assert abs(result.star_fluxes[0] - FLUX) < 2 * result.star_flux_errors[0]

@@ -8,9 +8,10 @@ from scipy.ndimage import gaussian_filter
 import lnocl
 from lnocl.core.scene.estimate import Estimate
 from lnocl.core.scene.forward_model import Model
+from lnocl.core.scene.hosts import light_of_host
 from lnocl.core.scene.scene import Scene
 from lnocl.core.scene.smooth_field import SmoothField
-from lnocl.core.scene.texture import ROUND, Texture, resolution
+from lnocl.core.scene.texture import Texture, resolution
 from lnocl.core.scene.view import View, Window
 from lnocl.core.solvers import least_squares, near_star
 from lnocl.core.solvers.near_star import CUSP, DEVIATION
@@ -82,8 +83,8 @@ def doubts(scene, sky, fluxes):
 
     width, own = resolution(scene), light(psfs)
     for s, (x, y) in enumerate(scene.places):
-        is_round = np.hypot(X - x, Y - y) <= ROUND * width
-        star = CUSP * sky[is_round].sum() * light(psfs, np.eye(len(fluxes))[s])
+        host = light_of_host(sky, Y[:, :1] - y, X[0] - x, width, 0.0)
+        star = CUSP * host * light(psfs, np.eye(len(fluxes))[s])
         columns.append([gaussian_filter(each, width * DEVIATION, mode="wrap") for each in star])
     slopes = np.array([slopes_of(psf, error) for psf in psfs])
     root = np.linalg.cholesky((1.0 - ALIKE) * np.eye(p) + ALIKE)

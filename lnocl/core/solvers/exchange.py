@@ -7,9 +7,8 @@ would move the flux by d. What star and extended source exchange has the varianc
 
 .. math:: v - v_0 + d^2
 
-It is told where it is more than ``v_0``, and is no more than the light of a host allows. A host
-lies all round the star, beyond its core too, and is fainter farther off. A jet is on one side, and
-a ring is brighter there.
+It is told where it is more than ``v_0``, and is no more than the light of a host allows
+(`lnocl.core.scene.hosts`).
 """
 
 from __future__ import annotations
@@ -18,16 +17,14 @@ import numpy as np
 
 from lnocl.core.scene.arrays import Array, Mask
 from lnocl.core.scene.estimate import Estimate
-from lnocl.core.scene.texture import CORE, ROUND
+from lnocl.core.scene.hosts import light_of_host
 from lnocl.core.solvers.fluxes import variances
-from lnocl.core.solvers.near_star import CUSP, NearStar, Surroundings, offsets_from, window_round
+from lnocl.core.solvers.near_star import NearStar, Surroundings, offsets_from, window_round
 
 # The share of the gradient at which conjugate gradients end.
 FINISHED = 1e-2
-# The light that may be exchanged is so many standard deviations.
-DEVIATIONS = 2.0
-# How far off a host is fainter, resolutions, and the sectors in which it is looked for.
-FAR, SECTORS = 3.0, 8
+# The light that may be exchanged is so many standard deviations, and so many times the host's.
+DEVIATIONS, MOST = 2.0, 3.0
 
 
 def exchanged(estimate: Estimate, least: float) -> Array:
@@ -50,7 +47,7 @@ def exchanged(estimate: Estimate, least: float) -> Array:
     for first in range(0, scene.n_stars, n_epochs):
         there = slice(first, first + n_epochs)
         is_lit = fluxes[there] > 0
-        most = DEVIATIONS * CUSP * _of_host(around, first)
+        most = MOST * _of_host(around, first)
         if (is_lit & (least * fluxes[there] < most)).any():
             near = NearStar(around, first, FINISHED)
             light = _exchanged(near, np.isin(near.held, np.arange(first, first + n_epochs)))
@@ -60,23 +57,11 @@ def exchanged(estimate: Estimate, least: float) -> Array:
 
 
 def _of_host(around: Surroundings, star: int) -> float:
-    """Return the light of the extended source that lies all round a star and falls, scaled.
-
-    It is as bright under the star as between core and `ROUND`, by the lower quartile of sectors.
-    """
-    scene, width = around.scene, around.width
+    """Return the light of the host of a star, scaled."""
+    scene = around.scene
     window, hidden = window_round(around, star)
-    rows, columns = offsets_from(scene, star, window)
-    distance = (np.hypot(rows, columns) - hidden) / width
-    sector = ((np.arctan2(rows, columns) / (2.0 * np.pi) + 0.5) * SECTORS).astype(int) % SECTORS
     sky = around.estimate.part(window.finer(scene.oversample).of(scene.grid))
-    is_round, is_far = ((distance > a) & (distance <= b) for a, b in ((CORE, ROUND), (ROUND, FAR)))
-    parts = [sky[is_round & (sector == k)] for k in range(SECTORS)]
-    means = sorted(float(part.mean()) for part in parts if part.size)
-    level = means[len(means) // 4] if means else 0.0
-    if is_far.any() and level <= sky[is_far].mean():
-        return 0.0
-    return level * float(np.count_nonzero(distance <= ROUND))
+    return light_of_host(sky, *offsets_from(scene, star, window), around.width, hidden)
 
 
 def _exchanged(near: NearStar, wanted: Mask) -> Array:

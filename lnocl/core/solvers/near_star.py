@@ -6,9 +6,9 @@ fluxes and positions of stars, and their errors, depend on no iteration. For err
 halos are unknown too: what the images tell of them beyond the window is their prior in it.
 
 Where PSFs are not exact their errors are unknown too (`lnocl.core.solvers.psf_errors`). So is a
-cusp of the extended source under each star, a Gaussian as wide as the resolution, as bright as the
-light round the star may hide: a host that is as narrow as the PSF exchanges light with
-the star and the PSF's width.
+cusp of the extended source under each star that has a host (`lnocl.core.scene.hosts`), a Gaussian
+as wide as the resolution: a host that is as narrow as the PSF exchanges light with the star and the
+PSF's width.
 """
 
 from __future__ import annotations
@@ -26,8 +26,9 @@ from lnocl.core.scene.arrays import Array
 from lnocl.core.scene.camera import Camera, adjoint_of, seen_by
 from lnocl.core.scene.detector import on_sky
 from lnocl.core.scene.estimate import Estimate
+from lnocl.core.scene.hosts import light_of_host
 from lnocl.core.scene.scene import Scene
-from lnocl.core.scene.texture import ROUND, Texture, hidden_radii, hidden_radius, resolution
+from lnocl.core.scene.texture import Texture, hidden_radii, hidden_radius, resolution
 from lnocl.core.scene.transforms import enlarged
 from lnocl.core.scene.view import Places, View, Window
 from lnocl.core.solvers.fluxes import precision
@@ -46,8 +47,8 @@ from lnocl.core.solvers.sources import Sources
 WINDOW, NEIGHBOURS = 9.0, 4.0
 # What lies farther from a window has no part in the texture there, resolutions.
 MARGIN = 3.0
-# The standard deviation of the light of a cusp under a star, over the light round it.
-CUSP = 1.5
+# The standard deviation of the light of a cusp under a star, over that of a host round it.
+CUSP = 6.0
 # The standard deviation of a Gaussian of unit full width at half maximum.
 DEVIATION = VARIANCE**0.5
 # The inverse variance of what is held.
@@ -192,9 +193,9 @@ class NearStar:
 
     def _cusp(self, around: Surroundings, star: int) -> float:
         """Return the standard deviation of the light of a cusp under a star."""
-        distance = np.hypot(*offsets_from(around.scene, star, self.window))
-        is_round = distance - self.hidden <= ROUND * self.resolution
-        return CUSP * float(around.estimate.part(self.places(around.scene))[is_round].sum())
+        sky = around.estimate.part(self.places(around.scene))
+        rows, columns = offsets_from(around.scene, star, self.window)
+        return CUSP * light_of_host(sky, rows, columns, self.resolution, self.hidden)
 
     def _responses(self, around: Surroundings) -> Array:
         """Return what a flat sky of ones is in the window of each image."""
