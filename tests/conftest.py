@@ -46,11 +46,17 @@ def _take_psf_error(error):
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_runtest_setup(item):
-    """Have PSFs of tests exact, as those of simulations are; documentation has the default.
+    """Have PSFs of tests exact, as those of simulations are.
 
     Tests of PSFs that are not exact give `psf_error`.
     """
-    _take_psf_error(PSF_ERROR if isinstance(item, pytest.DoctestItem) else 0.0)
+    _take_psf_error(0.0)
+
+
+@pytest.hookimpl(trylast=True)
+def pytest_runtest_teardown(item):
+    """Give back the default, which examples have: these hooks are of tests alone."""
+    _take_psf_error(PSF_ERROR)
 
 
 @pytest.fixture(scope="module")

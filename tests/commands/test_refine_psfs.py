@@ -77,8 +77,8 @@ def test_the_file_has_the_psfs_and_their_parameters(capsys):
     np.testing.assert_array_equal(fits.getdata("out.fits"), result.extended)
 
 
-def test_by_default_what_does_not_fit_is_refined(capsys):
-    assert run() == 0
+def test_what_does_not_fit_is_refined_where_that_is_asked(capsys):
+    assert run("--refine-psfs", "jitter") == 0
     assert "lnocl: PSFs refined, jitter fitted: their misfit is " in capsys.readouterr().err
     assert fits.getheader("out.fits")["PSFUSED"] is True
 
