@@ -193,8 +193,8 @@ def _points(
         information[np.ix_(image.unknowns, image.unknowns)] += weighted @ image.slopes.T
         moments[image.unknowns] += weighted @ left.ravel()
         images.append(image._replace(slopes=weighted))
-    told = np.diag(information)  # nothing of what no image shows
-    units = np.divide(1.0, np.sqrt(told), out=np.zeros(n + 1), where=told > 0)
+    known = np.diag(information)  # 0 of what no image shows
+    units = np.divide(1.0, np.sqrt(known), out=np.zeros(n + 1), where=known > 0)
     scaled = information * units * units[:, None] + ROUNDING * np.eye(n + 1)
     inverse = np.linalg.inv(scaled) * units * units[:, None]
     fluxes, errors = np.zeros((2, len(at[0])))
