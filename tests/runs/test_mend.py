@@ -1,5 +1,6 @@
 """What is done about PSFs and positions: nothing where they are right, else what mends."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -7,7 +8,8 @@ import pytest
 from regions import CirclePixelRegion, PixCoord
 
 import lnocl
-from lnocl.core.runs.psf_refinement import _is_trusted, _settle, _State
+from lnocl.core.runs.psf_refinement import _clean, _is_trusted, _settle, _State
+from lnocl.core.scene.fields import PSF_ERROR
 from lnocl.core.scene.psf_families import PsfFamilies
 from lnocl.core.scene.psf_misfit import PsfMisfit
 from lnocl.errors import LnoclWarning
@@ -31,12 +33,13 @@ def blurred(*values):
     return families.psfs(families.first()._replace(values=np.array([values])))[0]
 
 
-def solve(psf=PSF, beside=(0.0, 0.0), sky=SKY, given=PSF, **options):
+def solve(psf=PSF, beside=(0.0, 0.0), sky=SKY, given=PSF, error=0.0, **options):
     spectrum = np.fft.rfft2(sky) * np.fft.rfft2(np.fft.ifftshift(psf))
     means = np.fft.irfft2(spectrum, sky.shape)
     means += FLUX * np.roll(psf, (STAR[1] - N // 2, STAR[0] - N // 2), (0, 1)) + LEVEL
     counts = np.random.default_rng(3).poisson(means.clip(0.0)).astype(float)
-    observation = lnocl.Observation(counts, given, background=LEVEL, psf_centre="given")
+    known = {"background": LEVEL, "psf_centre": "given", "psf_error": error}
+    observation = lnocl.Observation(counts, given, **known)
     stars = [np.add(STAR, beside)]
     return lnocl.deconvolve(observation, stars, **{**RUN, **options})
 
@@ -242,6 +245,27 @@ def test_noise_is_taken_from_wings_that_are_negative():
     assert found.star_fluxes == pytest.approx(FLUX, rel=0.03)
     kept = solve(given=noisy)
     np.testing.assert_array_equal(kept.psfs[0], noisy / noisy.sum())
+
+
+@pytest.mark.parametrize(("kappa", "is_used"), [(0.0, True), (0.21, True), (0.25, False)])
+def test_wings_without_noise_are_used_unless_they_fit_worse(kappa, is_used):
+    noisy = (PSF + 1e-4 * NOISE)[None]
+    before = replace(state(0.2, 1e4), psfs=noisy)
+    runs = SimpleNamespace(
+        observation=SimpleNamespace(oversample=1), fit=lambda *_: state(kappa, 1e4).estimate
+    )
+    found = _clean(runs, before)
+    assert (found.psfs.min() >= 0) == is_used
+    assert (found is before) != is_used
+
+
+def test_noise_of_wings_is_taken_where_no_misfit_shows_it():
+    """Of nights on a host, seen through PSFs made of stars, 0.79 of the star was left."""
+    sky = 60.0 * np.exp(-np.hypot(X - 32.0, (Y - 21.0) * 1.5) / 8.0)
+    noisy = PSF + 2e-5 * NOISE
+    assert noisy[noisy < 0].sum() < -1e-3
+    found = solve(sky=sky, given=noisy, error=PSF_ERROR)
+    assert found.psfs.min() >= 0.0
 
 
 @pytest.mark.exhaustive

@@ -41,8 +41,8 @@ from lnocl.errors import counted, note, warn
 MENDED, GONE = 0.5, 2.0
 # None is taken that leaves a star less than this share of its flux, or so little to judge by.
 FADED = 0.5
-# Wings without noise are to leave less than this share.
-CLEANED = 0.99
+# Wings are noisy where negative pixels have this share of the light.
+NOISY = 1e-3
 # Free pixels, which may fit anything, are to leave less than this share of kappa. Where it is not
 # significant they are tried above this kappa.
 FITTED, FREED = 0.3, 0.1
@@ -94,7 +94,8 @@ def mend(
 ) -> Mended:
     """Return a setup whose positions and PSFs are mended where the images ask for it.
 
-    The noise of PSFs is taken from their wings first. PSFs that may have an error then become the
+    The noise of PSFs that have negative pixels, but for exact ones that fit, is taken from their
+    wings first, unless they fit worse so. PSFs that may have an error then become the
     mean of what the stars show of it (`lnocl.core.runs.psf_posterior`), unless they fit worse so.
     Where they are off by no more than that error holds, neither jitter nor pixels are fitted
     unasked, and stars take their marginal fluxes. Where they are off by more, the error is raised
@@ -102,8 +103,7 @@ def mend(
 
     What does not fit then is mended: stars are moved, the families are fitted, and pixels freed.
     Each is tried only where the misfit before is in doubt. It is taken where it leaves less than
-    half of kappa, or nothing to doubt, and every star more than half its flux. Wings without noise
-    are taken where they lower kappa.
+    half of kappa, or nothing to doubt, and every star more than half its flux.
 
     Free pixels fit any star, and may take some of its surroundings for the PSF. So they are to
     leave less than 0.3 of kappa, and the error that is allowed for is the one before them.
@@ -128,7 +128,8 @@ def mend(
         return Mended(setup)
     psfs = observation.psfs_over_images
     given = state = _State(psfs, runs.fit(psfs, runs.stars, moves is True), moves is True)
-    if state.misfit.is_doubtful and names and (observation.psfs < 0).any():
+    may_err = state.misfit.is_doubtful or bool(observation.psf_error)
+    if names and may_err and _are_noisy(observation.psfs):
         state = _clean(runs, state)
     done = ["the noise of wings taken"] if state.psfs is not psfs else []
     if names and observation.psf_error:
@@ -230,12 +231,22 @@ def _move(runs: GuardedRuns, state: _State) -> _State:
 
 
 def _clean(runs: GuardedRuns, state: _State) -> _State:
-    """Return the state with the noise taken from the wings of PSFs, where that lowers kappa."""
+    """Return the state with the noise taken from the wings of PSFs, unless they fit worse so.
+
+    Noise of wings hands the light of stars to the extended source, which it spreads, and nothing of
+    that shows at the stars.
+    """
     q = runs.observation.oversample
     psfs = mapped(state.psfs, lambda _, stack: without_noise(stack, q))
     stars = state.estimate.scene.places
     cleaned = _State(psfs, runs.fit(psfs, stars, state.moves), state.moves)
-    return cleaned if cleaned.misfit.kappa < CLEANED * state.misfit.kappa else state
+    is_worse = cleaned.misfit.significance > state.misfit.significance + GONE
+    return state if is_worse else cleaned
+
+
+def _are_noisy(psfs: Array) -> bool:
+    """Return whether the negative pixels of a PSF have more of its light than rounding leaves."""
+    return bool((psfs.clip(max=0.0).sum(axis=(1, 2)) < -NOISY).any())
 
 
 def _fit(
