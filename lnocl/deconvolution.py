@@ -290,8 +290,8 @@ def deconvolve(
     the brightest stars, after a run with a fixed weight, makes the PSFs of the reconstruction,
     three times in turn (`lnocl.core.runs.psf_posterior`). Stars that lie off by more than such PSFs
     may be shifted are moved, where they may be. Points beside stars that are none of them are held
-    meanwhile (`lnocl.core.runs.companions`). All of it is marginalised in the errors of fluxes and
-    places (:doc:`/validation/psf_error`).
+    meanwhile (`lnocl.core.solvers.companions`). All of it is marginalised in the errors of fluxes
+    and places (:doc:`/validation/psf_error`).
 
     **PSFs that do not fit** leave light beside a star, and an extended source that is free there
     takes it up. So PSFs are judged by short runs in a window round the stars. In these the
@@ -300,11 +300,11 @@ def deconvolve(
     Where their chi squared exceeds its expectation by five standard deviations, or by three and the
     error is above 0.025, positions and PSFs are refined as far as they may be: exact PSFs only
     where that is asked, and jitter and pixels unasked only where the error is above twice
-    `psf_error`, which is raised to it. They are used where they take two standard
-    deviations or more, and leave less than half of the error, or nothing that noise does not
-    explain. Free pixels, which may fit anything, are used where they leave less
-    than 0.3 of it, and change no star's flux by more than κ. Read noise that is larger than the
-    images show is lowered for all this.
+    `psf_error`, which is raised to it. They are used where they take two standard deviations or
+    more, and leave less than half of the error, or nothing that noise does not explain. Free
+    pixels, which may fit anything, are used where they leave less than 0.3 of it, and change no
+    star's flux by more than κ. Read noise that is larger than the images show is lowered for all
+    this.
 
     What is left, a relative error κ of the PSFs, adds to λ twice the standard deviation of the data
     term's gradient by it, ``2 sqrt(sum_j (A_j^2)^T (κ S_j / m_j)^2)``, with S_j the starlight. So

@@ -16,18 +16,15 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from lnocl.core.runs.companions import Companion, companions
 from lnocl.core.runs.outcome import Outcome
 from lnocl.core.scene.arrays import Array, number_in, whole
 from lnocl.core.scene.detector import on_sky
 from lnocl.core.scene.estimate import Estimate
 from lnocl.core.scene.quantities import in_unit
 from lnocl.core.scene.texture import SHARE_NEAR
-from lnocl.core.solvers.halos import halo_errors
-from lnocl.detection.point_test import point_flux
 from lnocl.detection.score import Null
 from lnocl.detection.score_map import ScoreMap
-from lnocl.detection.score_noise import MANY
+from lnocl.detection.table import CLEAR, POINT_SOURCE, detections, points_beside_stars
 from lnocl.errors import InputError
 from lnocl.plotting.significance import SignificanceView, draw_significance
 
@@ -35,20 +32,12 @@ if TYPE_CHECKING:
     from astropy.table import QTable
     from matplotlib.figure import Figure
 
-# A point is told from the extended source where it is so many errors above what that may be, and
-# there is light round a place where the score there is so many times its noise.
-CLEAR = 3.0
 # A source that was put in is found by a detection within so many resolutions.
 NEAR = 0.7
-# Error of a place between pixels, pixels of the sky.
-INTERPOLATED = 0.02
-# Companions are looked for in so many rings round a star, and at so many of the highest maxima.
-FARTHEST, MOST_LIKELY = 3, 4
 # Of more false alarms in a field the number is not what the threshold says.
 MOST_ALARMS = 10.0
 # The threshold of fewer is beyond what numbers hold.
 FEWEST_ALARMS = 1e-200
-POINT_SOURCE, EXTENDED = "point", "extended"
 
 
 def null_of(outcome: Outcome, estimate: Estimate | None = None) -> Null:
@@ -61,34 +50,6 @@ def null_of(outcome: Outcome, estimate: Estimate | None = None) -> Null:
     if refinement is not None and refinement.psf_error:
         errors = refinement.edges, refinement.errors_in_rings
     return Null(estimate or outcome.estimate, outcome.moves, errors)
-
-
-def _beside_stars(
-    outcome: Outcome, null: Null, found: ScoreMap, least: float
-) -> tuple[Estimate, list[Companion]]:
-    """Return companions, and the estimate that has them as stars.
-
-    A companion scatters the ring that it lies in, and hides so from a map, or has a maximum of it
-    beside its place. So points are tried where a place near a star has more than counts scatter,
-    and at maxima where errors of PSFs may matter.
-    """
-    score, q = found.score, outcome.observation.oversample
-    if found.width or not outcome.scene.n_stars:
-        return outcome.estimate, []
-    is_near = score.is_tested & (null.rings < FARTHEST)
-    places, _, gaussian = found.maxima(least)
-    x, y = np.round(places).astype(int).T
-    rows, columns = score.values.shape
-    at = y % rows, x % columns
-    may_err = found.noise.degrees[at] < MANY
-    if not may_err.any() and not (score.values[is_near] > CLEAR).any():
-        return outcome.estimate, []
-    pixels, fluxes = (places - (q - 1) / 2.0) / q, found.peak_fluxes(*at)
-    likely = [
-        Companion(pixels[i], float(fluxes[i]), np.zeros(3), float(gaussian[i]))
-        for i in np.flatnonzero(may_err)[:MOST_LIKELY]
-    ]
-    return companions(outcome.estimate, likely)
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,8 +92,8 @@ class Significance:
     A companion scatters the ring round its star that it lies in, as an error of the PSF does, and
     hides so, the brighter the more. Where a place within three resolutions of a star has three
     standard deviations of the counts, points are tried there against all that the PSF may have
-    wrong (`lnocl.core.runs.companions`). Those found are detections, with the errors of that fit,
-    and stars in the map. How often noise alone raises an alarm was measured:
+    wrong (`lnocl.core.solvers.companions`). Those found are detections, with the errors of that
+    fit, and stars in the map. How often noise alone raises an alarm was measured:
     :doc:`/validation/detections`.
 
     Examples
@@ -430,7 +391,7 @@ def significance(outcome: Outcome, width: float, false_alarms: float) -> Signifi
     null = null_of(outcome)
     found = ScoreMap(null, width * observation.oversample)
     least = found.threshold(false_alarms)
-    estimate, beside = _beside_stars(outcome, null, found, least)
+    estimate, beside = points_beside_stars(outcome.estimate, null, found, least)
     if beside:
         null = null_of(outcome, estimate)
         found = ScoreMap(null, 0.0)
@@ -449,7 +410,7 @@ def significance(outcome: Outcome, width: float, false_alarms: float) -> Signifi
         false_alarms,
         width,
         null.resolution / observation.oversample,
-        _detections(outcome, null, found, least, beside),
+        detections(outcome.estimate, outcome.moves, found, least, beside, null.resolution),
         null,
         found,
         outcome,
@@ -486,60 +447,3 @@ def check_injections(n: object, seed: object) -> None:
     """
     whole("injections", n, 1)
     whole("seed", seed, 0)
-
-
-def _detections(
-    outcome: Outcome, null: Null, found: ScoreMap, least: float, beside: Sequence[Companion]
-) -> QTable:
-    from astropy.table import QTable
-    from astropy.units import electron, pix
-    from scipy.spatial import KDTree
-
-    places, values, gaussian = found.maxima(least)
-    scene, q = outcome.scene, outcome.observation.oversample
-    x, y = np.round(places).astype(int).T
-    rows, columns = found.values.shape
-    at = y % rows, x % columns
-    errors, fluxes = found.errors[at], found.peak_fluxes(*at)
-    kinds = np.full(len(places), POINT_SOURCE, dtype="U8")
-    pixels = (places - (q - 1) / 2.0) / q
-    raised = halo_errors(outcome.estimate).raised
-    # Beside its own light the flux of a bright source is steep, and not to be interpolated.
-    is_steep = fluxes - found.fluxes[at] > errors
-    for i, place in enumerate(places):
-        if found.width:
-            kinds[i] = EXTENDED
-        elif is_steep[i] or found.light_round(place, values[i], null.resolution) > CLEAR:
-            fluxes[i], errors[i] = point_flux(
-                outcome.estimate, pixels[i], fluxes[i], outcome.moves, raised
-            )
-            kinds[i] = POINT_SOURCE if fluxes[i] > CLEAR * errors[i] else EXTENDED
-    # Of a maximum between pixels the place errs by its noise, and by how it is interpolated.
-    curvature = np.moveaxis(found.score.curvature[:, :, *at], -1, 0)
-    spread = np.sqrt(np.diagonal(np.linalg.inv(curvature), axis1=1, axis2=2))[:, ::-1]
-    ratio = np.maximum(found.fluxes[at] / found.errors[at], 1.0)
-    moved = np.hypot(spread / ratio[:, None], INTERPOLATED) / q
-    beside = [each for each in beside if each.significance > least]
-    pixels = np.concatenate([pixels, np.reshape([each.place for each in beside], (-1, 2))])
-    fluxes = np.append(fluxes, [each.flux for each in beside])
-    errors = np.append(errors, [each.errors[0] for each in beside])
-    moved = np.concatenate([moved, np.reshape([each.errors[1:] for each in beside], (-1, 2))])
-    gaussian = np.append(gaussian, [each.significance for each in beside])
-    kinds = np.append(kinds, [POINT_SOURCE] * len(beside))
-    stars = scene.stars[:: outcome.observation.n_epochs]
-    distance, nearest = KDTree(stars).query(pixels)
-    table = QTable(
-        {
-            "x": pixels[:, 0] * pix,
-            "y": pixels[:, 1] * pix,
-            "x_error": moved[:, 0] * pix,
-            "y_error": moved[:, 1] * pix,
-            "flux": fluxes * electron,
-            "flux_error": errors * electron,
-            "significance": gaussian,
-            "star": np.where(np.isfinite(distance), nearest + 1, 0),
-            "distance": distance * pix,
-            "kind": kinds,
-        }
-    )
-    return table[np.argsort(-table["significance"], kind="stable")]

@@ -11,9 +11,9 @@ from __future__ import annotations
 import numpy as np
 
 from lnocl.core.scene.arrays import Array
-from lnocl.core.scene.detector import on_sky
 from lnocl.core.scene.estimate import Estimate
-from lnocl.core.scene.texture import Texture, resolution
+from lnocl.core.scene.texture import resolution
+from lnocl.core.solvers.companions import Companion, holding
 from lnocl.core.solvers.fluxes import variances
 from lnocl.core.solvers.near_star import NearStar, Surroundings
 
@@ -43,20 +43,16 @@ def point_flux(
     raised : ndarray of float64, shape (n_shapes,)
         As of `lnocl.core.solvers.halos.halo_errors`: halos are unknown too.
     """
-    scene = estimate.scene
-    n, n_epochs = scene.n_stars, scene.observation.n_epochs
-    width = resolution(scene)
-    there = on_sky(np.array([place]), scene.oversample)
-    # The light of the point is in the estimate of the extended source, and its own now.
-    without = Texture(estimate.sky, there, width).mean
-    fluxes = np.insert(estimate.star_fluxes, n, [max(flux, 0.0)] * n_epochs)
-    other = Estimate(scene.with_star(place), without, fluxes)
+    n, n_epochs = estimate.scene.n_stars, estimate.scene.n_epochs
+    point = Companion(place, max(flux, 0.0), np.zeros(3), 0.0)
+    other = holding(estimate, [point], resolution(estimate.scene))
     near = NearStar(Surroundings(other, moves, raised, holds_shapes=True), n, FINISHED)
     at = np.array([np.flatnonzero(near.held == s)[0] for s in range(n, n + n_epochs)])
     at = at[np.isfinite(variances(near.fit.information)[at])]
     if not len(at):
         return 0.0, np.inf
     change, _ = near.fit.solve()
-    values, weights = fluxes[n] + change[at] * scene.unit, 1.0 / near.fit.variances(at)
+    values = point.flux + change[at] * estimate.scene.unit
+    weights = 1.0 / near.fit.variances(at)
     mean = float((weights * values).sum() / weights.sum())
-    return mean, float(weights.sum() ** -0.5) * scene.unit
+    return mean, float(weights.sum() ** -0.5) * estimate.scene.unit

@@ -1,88 +1,30 @@
-r"""Points beside stars that are tried before their light goes to the error of a PSF.
-
-A companion that is not among the stars bends a PSF that is fitted to them. Beside each of the
-brightest stars a point is tried at places in the sky, by the least squares of star, level, all that
-the PSF may have wrong (`lnocl.core.solvers.psf_errors`), and the point. The errors of the PSF's
-pixels count as noise. With the residuals r of an extended source that is a level, their precisions
-P, the derivatives J by these unknowns, whose priors have the information Pi, and the point t it has
-the flux ``T / F``,
-
-.. math::
-    T = t^T P r - t^T P J H^{-1} J^T P r, \quad F = t^T P t - t^T P J H^{-1} J^T P t, \quad
-    H = J^T P J + \Pi
-
-What lies on both sides of the star alike is no companion: the flux at the mirrored place is taken
-off. Where the rest is largest, in its errors, a point takes the place of the extended source, and
-has to stand against that and the PSF's error together (`lnocl.core.solvers.near_star`).
-"""
+"""Points beside stars that are held while PSFs are fitted."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import suppress
-from copy import copy
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy.spatial import KDTree
 
 from lnocl.core.runs.guarded_runs import GuardedRuns
 from lnocl.core.runs.halos import settle_halos
-from lnocl.core.runs.psf_posterior import NARROWEST
 from lnocl.core.runs.start import Setup, make_start
 from lnocl.core.runs.steady import run_steadily
 from lnocl.core.scene.arrays import Array
-from lnocl.core.scene.detector import on_sky
-from lnocl.core.scene.estimate import Estimate
-from lnocl.core.scene.fields import PSF_ERROR
-from lnocl.core.scene.texture import Texture
-from lnocl.core.solvers.fluxes import variances
-from lnocl.core.solvers.least_squares import ROUNDING, LinearImage
-from lnocl.core.solvers.near_star import NearStar, Surroundings, offsets_from
-from lnocl.core.solvers.psf_errors import CORRELATED
+from lnocl.core.solvers.companions import companions
 from lnocl.errors import DivergedError, NotFiniteError, counted, note
 from lnocl.process import ignored_notes, ignored_warnings
 
-# So many of the brightest stars are looked at, and so many points are found, at most.
-MOST_STARS, MOST_POINTS = 4, 3
-# Points are tried at these distances from a star, resolutions, so many to one at first: nearer ones
-# are part of it, and of those farther off a PSF takes no light (docs/validation/psf_error.md).
-NEAREST, FARTHEST, STEPS = 0.5, 3.0, 2.0
-# Standard errors that a point has where it is tried, and beside what the extended source may be
-# there, as of detections; each of its steps is so many pixels at most.
-SIGNIFICANT, CLEAR, MOVED, N_STEPS = 5.0, 3.0, 1.0, 2
-# The share of the gradient at which conjugate gradients end, and the information of what is free.
-FINISHED, FREE = 1e-3, 1e-9
 # Iterations of a run, at most.
 N_ITER = 300
 
 
-class Companion(NamedTuple):
-    """A point beside a star.
-
-    Attributes
-    ----------
-    place : ndarray of float64, shape (2,)
-        (x, y), pixels of the images.
-    flux : float
-        Electrons.
-    errors : ndarray of float64, shape (3,)
-        Standard errors of flux, x and y.
-    significance : float
-        By how many standard errors it is brighter than the mirrored place, beside all that the PSF
-        may have wrong.
-    """
-
-    place: Array
-    flux: float
-    errors: Array
-    significance: float
-
-
 def beside_stars(setup: Setup, tick: Callable[[], object] = int) -> Array:
-    """Return the places of `companions`, those that a run of a window round the stars shows.
+    """Return the places of points that a run of a window round the stars shows, shape (n, 2).
+
+    They are those of `lnocl.core.solvers.companions`, (x, y), pixels of the images.
 
     Parameters
     ----------
@@ -104,164 +46,3 @@ def beside_stars(setup: Setup, tick: Callable[[], object] = int) -> Array:
         number = counted(len(places), "point")
         note(f"{number} beside stars held while PSFs are fitted, {named}: name what is a star")
     return places
-
-
-def companions(
-    estimate: Estimate, likely: Sequence[Companion] = ()
-) -> tuple[Estimate, list[Companion]]:
-    """Return points beside the stars, and the estimate that has them as stars too.
-
-    Parameters
-    ----------
-    estimate : Estimate
-        That of a run with the stars that are known.
-    likely : sequence of Companion
-        Further points to try then, the likeliest first; their errors need not be known.
-    """
-    scene, found = copy(estimate.scene), list[Companion]()
-    error = max(scene.observation.psf_error, PSF_ERROR)  # those that are fitted are doubted
-    scene.observation = scene.observation.replace(psf_error=error)
-    estimate = Estimate(scene, estimate.sky, estimate.star_fluxes)
-    light = estimate.star_fluxes[: scene.n_stars].reshape(-1, scene.n_epochs).sum(axis=1)
-    brightest = np.argsort(-light, kind="stable")[:MOST_STARS]
-    stars = (scene.n_epochs * brightest[light[brightest] > 0]).tolist()
-    beside = estimate
-    while stars and len(found) < MOST_POINTS:
-        around = Surroundings(beside, False)
-        if around.width < NARROWEST:  # samples do not hold its shape
-            break
-        likeliest = max((_likeliest(around, star) for star in stars), key=lambda each: each[-1])
-        if likeliest.significance <= SIGNIFICANT:
-            break
-        tried = _with_points(estimate, [*found, likeliest])
-        if tried is None:
-            break
-        beside, found = tried
-    for point in likely:
-        width = NEAREST * Surroundings(estimate, False).width / scene.oversample
-        is_new = all(np.hypot(*(point.place - each.place)) > width for each in found)
-        if is_new and (tried := _with_points(estimate, [*found, point])):
-            beside, found = tried
-    return beside, found
-
-
-def _likeliest(around: Surroundings, star: int) -> Companion:
-    """Return the likeliest point beside a star, its errors not known."""
-    near, scene = NearStar(around, star, FINISHED), around.scene
-    rows, columns = offsets_from(scene, star, near.window)
-    distance = np.hypot(rows, columns) / near.resolution
-    is_allowed = (distance > NEAREST) & (distance <= FARTHEST)
-    step = round(near.resolution / STEPS)
-    is_tried = np.zeros(distance.shape, bool)
-    is_tried[::step, ::step] = True
-    y, x = np.nonzero(is_tried & is_allowed)
-    if not len(y):
-        return Companion(scene.stars[star], 0.0, np.zeros(3), -np.inf)
-    fluxes, errors = _points(near, around.estimate, (y, x))
-    away = np.stack([columns[x], rows[y, 0]], axis=1)
-    _, opposite = KDTree(away).query(-away)
-    one_sided = (fluxes - np.maximum(fluxes[opposite], 0.0)) / errors
-    best = int(np.argmax(one_sided))
-    is_near = np.zeros(distance.shape, bool)  # those between, too
-    is_near[tuple(slice(max(at[best] - step + 1, 0), at[best] + step) for at in (y, x))] = True
-    y, x = np.nonzero(is_near & is_allowed)
-    fluxes, errors = _points(near, around.estimate, (y, x))
-    at = int(np.argmax(fluxes / errors))
-    place = scene.stars[star] + np.array([columns[x[at]], rows[y[at], 0]]) / scene.oversample
-    flux = max(float(fluxes[at]) * scene.unit, 0.0)
-    return Companion(place, flux, np.zeros(3), float(one_sided[best]))
-
-
-def _points(
-    near: NearStar, estimate: Estimate, at: tuple[NDArray[np.int_], ...]
-) -> tuple[Array, Array]:
-    """Return fluxes and errors of points at rows and columns of the sky in a window, scaled."""
-    n, scatters = len(near.prior), np.zeros((len(near.images), *near.window.shape))
-    if near.psfs is not None:
-        scatters = near.psfs.pixels(near.window.shape).scatter
-    extended = near.source.images_of(near.expected + estimate.part(near.places(estimate.scene)))
-    information, moments = np.diag([*np.zeros(n), FREE]), np.zeros(n + 1)
-    information[:n, :n] = near.prior
-    images = list[LinearImage]()
-    levels = near.fields[1].forward(np.ones(1))
-    each = zip(near.images, levels, extended, scatters, strict=True)
-    for image, flat, light, scatter in each:
-        noise = 1.0 + image.precision * (2.0 * np.pi * (CORRELATED * scatter) ** 2)
-        weights, left = image.precision / noise, image.left + light
-        image = image.beside([flat], np.array([n]))._replace(left=weights * left, precision=weights)
-        weighted = image.slopes * weights.ravel()
-        information[np.ix_(image.unknowns, image.unknowns)] += weighted @ image.slopes.T
-        moments[image.unknowns] += weighted @ left.ravel()
-        images.append(image._replace(slopes=weighted))
-    known = np.diag(information)  # 0 of what no image shows
-    units = np.divide(1.0, np.sqrt(known), out=np.zeros(n + 1), where=known > 0)
-    scaled = information * units * units[:, None] + ROUNDING * np.eye(n + 1)
-    inverse = np.linalg.inv(scaled) * units * units[:, None]
-    fluxes, errors = np.zeros((2, len(at[0])))
-    for k, (y, x) in enumerate(zip(*at, strict=True)):
-        point, shares, told, score = np.zeros(near.expected.shape), np.zeros(n + 1), 0.0, 0.0
-        point[y, x] = 1.0
-        for image, seen in zip(images, near.source.images_of(point), strict=True):
-            shares[image.unknowns] += image.slopes @ seen.ravel()
-            told += float(np.vdot(image.precision, seen**2))
-            score += float(np.vdot(image.left, seen))
-        of_unknowns = inverse @ shares
-        told = max(told - float(shares @ of_unknowns), FREE)
-        fluxes[k], errors[k] = (score - of_unknowns @ moments) / told, told**-0.5
-    return fluxes, errors
-
-
-def _with_points(
-    estimate: Estimate, points: Sequence[Companion]
-) -> tuple[Estimate, list[Companion]] | None:
-    """Return the estimate with points instead of what it holds there, and the points as they fit.
-
-    None where one of them is not clear, or has come too near to a star.
-    """
-    fitted, width = list(points), Surroundings(estimate, False).width
-    n, n_epochs = estimate.scene.n_stars, estimate.scene.n_epochs
-    for k in [*range(len(points))] * N_STEPS:
-        now = _holding(estimate, fitted, width)
-        point = _fitted(now, n + k * n_epochs, fitted[k])
-        if point is None:
-            return None
-        fitted[k] = point
-    away = [np.hypot(*(each.place - estimate.scene.stars).T).min() for each in fitted]
-    if min(away) * estimate.scene.oversample < NEAREST * width:
-        return None
-    if any(each.flux < CLEAR * each.errors[0] for each in fitted):
-        return None
-    return _holding(estimate, fitted, width), fitted
-
-
-def _holding(estimate: Estimate, points: Sequence[Companion], width: float) -> Estimate:
-    """Return an estimate that has points as stars, instead of what it holds there."""
-    scene, n_epochs = estimate.scene, estimate.scene.n_epochs
-    places = np.array([each.place for each in points])
-    without = Texture(estimate.sky, on_sky(places, scene.oversample), width).mean
-    added = np.repeat([each.flux for each in points], n_epochs)
-    fluxes = np.insert(estimate.star_fluxes, [scene.n_stars] * len(added), added)
-    for place in places:
-        scene = scene.with_star(place)
-    return Estimate(scene, without, fluxes)
-
-
-def _fitted(estimate: Estimate, first: int, point: Companion) -> Companion | None:
-    """Return a point, the star `first`, after a step to where it fits; None where it has no light.
-
-    Its flux is the mean over epochs.
-    """
-    near = NearStar(Surroundings(estimate, True), first, FINISHED)
-    there = np.arange(first, first + estimate.scene.n_epochs)
-    at = near.unknowns[np.isin(near.held, there)]
-    at = at[np.isfinite(variances(near.fit.information)[at]).all(axis=1)]
-    if not len(at):
-        return None
-    change, _ = near.fit.solve()
-    unit = estimate.scene.unit
-    values = point.flux + change[at[:, 0]] * unit
-    weights = 1.0 / near.fit.variances(at[:, 0]) / unit**2
-    flux = float((weights * values).sum() / weights.sum())
-    place = point.place + change[at[0, 1:]].clip(-MOVED, MOVED)
-    errors = [weights.sum() ** -0.5, *np.sqrt(near.fit.variances(at[0, 1:]))]
-    return Companion(place, flux, np.array(errors), point.significance) if flux > 0 else None

@@ -24,7 +24,15 @@ from lnocl.core.scene.estimate import Estimate
 from lnocl.core.scene.penalty import Penalty
 from lnocl.core.solvers.least_squares import Field, LeastSquares, LinearImage
 from lnocl.core.solvers.near_star import N_STEPS, NearStar, Surroundings
-from lnocl.core.solvers.psf_errors import N_SHAPES, N_SLOPES, SHIFT, alike, count, with_errors
+from lnocl.core.solvers.psf_errors import (
+    N_SHAPES,
+    N_SLOPES,
+    NARROWEST,
+    SHIFT,
+    alike,
+    count,
+    with_errors,
+)
 from lnocl.errors import DivergedError, NotFiniteError
 from lnocl.process import ignored_notes, ignored_warnings
 
@@ -32,8 +40,6 @@ from lnocl.process import ignored_notes, ignored_warnings
 MOST_STARS = 4
 # Rounds of a run and of a step, and the longest step, standard deviations of the prior.
 ROUNDS, MAX_STEP = 3, 6.0
-# Full width at half maximum of the narrowest PSFs that are changed, in their pixels.
-NARROWEST = 2.0
 # What the `psf_error` of PSFs holds is an error of no more than so many times it.
 HELD = 2.0
 # The standard deviation of a place that is given, pixels.

@@ -7,7 +7,7 @@ would move the flux by d. What star and extended source exchange has the varianc
 
 .. math:: v - v_0 + d^2
 
-It is told where it is more than ``v_0``, and is no more than the light of a host allows
+It is told where it is more than ``v_0``. A host has no more to give than its light
 (`lnocl.core.scene.hosts`).
 """
 

@@ -53,6 +53,8 @@ Made = dict[tuple[int, tuple[int, int], str], Sequence[Any]]
 MARGIN = 8
 # The correlation of theta of two PSFs: those of a library err together, those of a frame alone.
 ALIKE = 0.5
+# Full width at half maximum of the narrowest PSFs whose samples hold their shape, in their pixels.
+NARROWEST = 2.0
 # The mean of the zero points of an epoch is known to this share of each: it is that of the fluxes.
 COMMON = 1e-3
 

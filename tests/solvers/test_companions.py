@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 import lnocl
-from lnocl.core.runs import companions as room
-from lnocl.core.runs.companions import Companion, companions
 from lnocl.core.scene.estimate import Estimate
 from lnocl.core.scene.forward_model import Model
 from lnocl.core.scene.scene import Scene
+from lnocl.core.solvers import companions as room
+from lnocl.core.solvers.companions import Companion, companions
 from lnocl.core.solvers.near_star import NearStar, Surroundings
 from lnocl.core.solvers.psf_errors import CORRELATED
 
@@ -91,9 +91,10 @@ NONE = {
 }
 
 
+@pytest.mark.parametrize("error", [0.03, 0.0])
 @pytest.mark.parametrize("name", NONE)
-def test_extended_sources_are_no_points(name):
-    assert not companions(start(observe(sky=NONE[name]), NONE[name]))[1]
+def test_extended_sources_are_no_points(name, error):
+    assert not companions(start(observe(sky=NONE[name], error=error), NONE[name]))[1]
 
 
 @pytest.mark.parametrize("wrong", [{"wrong": 1.04}, {"skew": -0.05}, {"skew": 0.2}])
