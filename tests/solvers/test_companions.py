@@ -11,6 +11,7 @@ from lnocl.core.scene.forward_model import Model
 from lnocl.core.scene.scene import Scene
 from lnocl.core.solvers import companions as room
 from lnocl.core.solvers.companions import Companion, companions
+from lnocl.core.solvers.halos import halo_errors
 from lnocl.core.solvers.near_star import NearStar, Surroundings
 from lnocl.core.solvers.psf_errors import CORRELATED
 
@@ -78,6 +79,17 @@ def test_a_point_that_is_likely_farther_off_is_taken_where_it_fits():
     assert abs(point.flux - flux) < 3 * point.errors[0]
     assert point.errors[0] < 0.1 * flux
     assert point.significance == 9.0
+
+
+def test_halos_that_are_not_known_are_in_the_errors_of_points():
+    halo = np.exp(-((X - 27) ** 2 + (Y - 28) ** 2) / 4)
+    observation = observe({(27.6, 27.9): 3e4}).replace(halos=halo)
+    fluxes = np.array([FLUX, 100.0, 100.0])
+    estimate = Estimate(Scene(observation, [STAR]), np.ones((N, N)), fluxes)
+    _, [known] = companions(estimate)
+    _, [found] = companions(estimate, raised=halo_errors(estimate).raised)
+    assert found.errors[0] > 1.1 * known.errors[0]
+    assert abs(found.flux - 3e4) < 3 * found.errors[0]
 
 
 def light(values):
