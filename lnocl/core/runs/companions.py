@@ -13,6 +13,8 @@ from lnocl.core.runs.halos import settle_halos
 from lnocl.core.runs.start import Setup, make_start
 from lnocl.core.runs.steady import run_steadily
 from lnocl.core.scene.arrays import Array
+from lnocl.core.scene.psf_field import mapped
+from lnocl.core.scene.psf_wings import are_noisy, without_noise
 from lnocl.core.solvers.companions import companions
 from lnocl.errors import DivergedError, NotFiniteError, counted, note
 from lnocl.process import ignored_notes, ignored_warnings
@@ -24,7 +26,8 @@ N_ITER = 300
 def beside_stars(setup: Setup, tick: Callable[[], object] = int) -> Array:
     """Return the places of points that a run of a window round the stars shows, shape (n, 2).
 
-    They are those of `lnocl.core.solvers.companions`, (x, y), pixels of the images.
+    They are those of `lnocl.core.solvers.companions`, (x, y), pixels of the images. The noise of
+    wings, which may look like one, is taken from the PSFs.
 
     Parameters
     ----------
@@ -33,8 +36,11 @@ def beside_stars(setup: Setup, tick: Callable[[], object] = int) -> Array:
     tick : callable, optional
         Is called after each iteration.
     """
-    runs, places = GuardedRuns(setup), np.zeros((0, 2))
-    near = runs.setup_of(setup.observation.psfs_over_images, runs.stars)
+    runs, places, observation = GuardedRuns(setup), np.zeros((0, 2)), setup.observation
+    psfs = observation.psfs_over_images
+    if are_noisy(observation.psfs):
+        psfs = mapped(psfs, lambda _, stack: without_noise(stack, observation.oversample))
+    near = runs.setup_of(psfs, runs.stars)
     near = replace(near, refine_positions=False)
     with suppress(DivergedError, NotFiniteError), ignored_warnings(), ignored_notes():
         start = settle_halos(make_start(near, runs.penalty))

@@ -31,7 +31,7 @@ from lnocl.core.scene.psf_families import PsfFamilies, PsfParameters
 from lnocl.core.scene.psf_faults import name_faults
 from lnocl.core.scene.psf_field import Psfs, mapped
 from lnocl.core.scene.psf_misfit import PsfMisfit
-from lnocl.core.scene.psf_wings import without_noise
+from lnocl.core.scene.psf_wings import are_noisy, without_noise
 from lnocl.core.scene.star_psfs import owned
 from lnocl.core.solvers.psf_fit import step
 from lnocl.errors import counted, note, warn
@@ -41,8 +41,6 @@ from lnocl.errors import counted, note, warn
 MENDED, GONE = 0.5, 2.0
 # None is taken that leaves a star less than this share of its flux, or so little to judge by.
 FADED = 0.5
-# Wings are noisy where negative pixels have this share of the light.
-NOISY = 1e-3
 # Free pixels, which may fit anything, are to leave less than this share of kappa. Where it is not
 # significant they are tried above this kappa.
 FITTED, FREED = 0.3, 0.1
@@ -129,7 +127,7 @@ def mend(
     psfs = observation.psfs_over_images
     given = state = _State(psfs, runs.fit(psfs, runs.stars, moves is True), moves is True)
     may_err = state.misfit.is_doubtful or bool(observation.psf_error)
-    if names and may_err and _are_noisy(observation.psfs):
+    if names and may_err and are_noisy(observation.psfs):
         state = _clean(runs, state)
     done = ["the noise of wings taken"] if state.psfs is not psfs else []
     if names and observation.psf_error:
@@ -242,11 +240,6 @@ def _clean(runs: GuardedRuns, state: _State) -> _State:
     cleaned = _State(psfs, runs.fit(psfs, stars, state.moves), state.moves)
     is_worse = cleaned.misfit.significance > state.misfit.significance + GONE
     return state if is_worse else cleaned
-
-
-def _are_noisy(psfs: Array) -> bool:
-    """Return whether the negative pixels of a PSF have more of its light than rounding leaves."""
-    return bool((psfs.clip(max=0.0).sum(axis=(1, 2)) < -NOISY).any())
 
 
 def _fit(

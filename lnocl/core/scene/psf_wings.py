@@ -11,6 +11,13 @@ from lnocl.core.scene.rings import Rings
 FAR = 0.9
 # Rings of fewer pixels do not tell noise from structure.
 FEWEST = 6
+# Wings are noisy where negative pixels have this share of the light.
+NOISY = 1e-3
+
+
+def are_noisy(psfs: Array) -> bool:
+    """Return whether the negative pixels of a PSF have more of its light than rounding leaves."""
+    return bool((psfs.clip(max=0.0).sum(axis=(1, 2)) < -NOISY).any())
 
 
 def without_noise(psfs: Array, oversample: int = 1) -> Array:

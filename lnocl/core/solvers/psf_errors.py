@@ -210,7 +210,7 @@ class PsfErrors:
 
         Light beyond the file, which counts where images are larger, has the standard deviation that
         the edge of the PSF tells. A level of all pixels has that of its border, which it is part
-        of.
+        of, or less: as a halo of the PSF may be as level, it holds at most `psf_error` of the light.
         """
         scene, (ny, nx) = self._estimate.scene, self._views[j].window.shape
         most = 2 * scene.oversample * ny, 2 * scene.oversample * nx
@@ -221,7 +221,8 @@ class PsfErrors:
         light, images = float(psf.sum()), scene.oversample * np.array(scene.observation.shape)
         if light > 0:
             flat = enlarged(np.ones(psf.shape), most, is_centred=True)
-            level = _on_border(psf) * (flat - psf.size / light * own)
+            height = min(_on_border(psf), self._error * light / psf.size)
+            level = height * (flat - psf.size / light * own)
             if (psf.shape < images).any():
                 edge = psf_edge(psf / light)
                 beyond = light * edge.wing(most) - edge.light * own
