@@ -15,6 +15,7 @@ from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy.stats import norm
 
 from lnocl.core.runs.outcome import Outcome
 from lnocl.core.scene.arrays import Array, number_in, whole
@@ -22,6 +23,8 @@ from lnocl.core.scene.detector import on_sky
 from lnocl.core.scene.estimate import Estimate
 from lnocl.core.scene.quantities import in_unit
 from lnocl.core.scene.texture import SHARE_NEAR
+from lnocl.core.solvers.companions import errors_beside
+from lnocl.core.solvers.halos import halo_errors
 from lnocl.detection.score import Null
 from lnocl.detection.score_map import ScoreMap
 from lnocl.detection.table import CLEAR, POINT_SOURCE, detections, points_beside_stars
@@ -147,7 +150,8 @@ class Significance:
         -------
         ndarray of float64, of the shape of the extended source
             Electrons; NaN where the images do not tell a source from stars. The extended source is
-            allowed for where it is: a point has to be three errors above what that may be.
+            allowed for where it is: a point has to be three errors above what that may be, and near
+            a star above what PSFs may have wrong (`lnocl.core.solvers.companions`).
 
         Raises
         ------
@@ -170,6 +174,7 @@ class Significance:
         number_in("completeness", completeness, "between 0 and 1", lambda given: 0 < given < 1)
         found, outcome = self._map, self._outcome
         fluxes = np.maximum(found.needed(self._at_threshold, completeness), self._told_from_source)
+        fluxes = np.maximum(fluxes, (CLEAR + norm.ppf(completeness)) * self._beside_psfs)
         ny, nx = outcome.observation.sky_shape
         return np.asarray(fluxes[:ny, :nx])
 
@@ -270,6 +275,14 @@ class Significance:
         if self._map.width:
             return np.zeros(self._map.values.shape)
         return np.asarray(CLEAR * SHARE_NEAR * self._null.brightest_structure() * self._map.unit)
+
+    @cached_property
+    def _beside_psfs(self) -> Array:
+        """The standard error of a point near a star beside what PSFs may have wrong, else 0."""
+        if self._map.width:
+            return np.zeros(self._map.values.shape)
+        estimate = self._outcome.estimate
+        return errors_beside(estimate, halo_errors(estimate).raised)
 
     def contrast_curves(self, completeness: Sequence[float] | float = (0.5, 0.9, 0.95)) -> QTable:
         """Return the faintest sources that would be found, against the distance from each star.

@@ -1,6 +1,7 @@
 """Sources beside the stars of a result: found, called a point or extended, and limited."""
 
 import runpy
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -172,6 +173,16 @@ def test_the_limit_of_a_half_is_about_the_threshold(found):
     flat = np.s_[4:10, 50:60]
     snr = found.limit(0.5)[flat] / found.flux_error[flat]
     assert (abs(snr - found.threshold) < 1.0).all()
+
+
+def test_points_near_a_star_are_three_errors_above_what_psfs_may_have_wrong(found, monkeypatch):
+    error = np.zeros(found._map.values.shape)
+    error[20:24, 43:46] = 1e5
+    monkeypatch.setattr("lnocl.significance.errors_beside", lambda *_: error)
+    before, after = found.limit(0.9), replace(found).limit(0.9)
+    beside = error[:N, :N] > 0
+    np.testing.assert_allclose(after[beside], (3 + 1.2815516) * 1e5)
+    np.testing.assert_array_equal(after[~beside], before[~beside])
 
 
 def test_a_jet_limits_points_on_it(found):

@@ -141,6 +141,23 @@ def test_fluxes_are_those_of_least_squares_with_all_unknowns():
     assert errors[0] == pytest.approx(expected, rel=1e-3)
 
 
+def test_errors_beside_a_star_are_those_of_points_at_like_distances():
+    estimate = start(observe())
+    errors = room.errors_beside(estimate)[:N, :N]
+    near = NearStar(Surroundings(estimate, False), 0, 1e-3)
+    away = R / near.resolution
+    assert (errors[(away <= 0.5) | (away > 3.0)] == 0).all()
+    top, left = near.window[:2]
+    for distance in (1.0, 2.0):
+        y, x = np.nonzero(abs(away - distance) < 0.1)
+        rows, columns = y - top, x - left
+        of_points = room._points(near, estimate, (rows, columns))[1] * estimate.scene.unit
+        assert np.median(errors[y, x]) == pytest.approx(np.median(of_points), rel=0.1)
+    exact = room.errors_beside(start(observe(error=0.0)))[:N, :N]
+    beside = abs(away - 1) < 0.3
+    assert (errors[beside] > 3 * exact[beside]).all()
+
+
 @pytest.mark.filterwarnings("ignore:held-out counts have chosen")
 def test_a_companion_that_is_not_named_stays_out_of_the_psf(caplog):
     """One width away, beside a PSF 3 % too wide; a third of it went to the PSF."""

@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
-from lnocl.core.scene.arrays import Array
+from lnocl.core.scene.arrays import Array, Mask
 from lnocl.core.scene.detector import on_sky
 from lnocl.core.scene.estimate import Estimate
 from lnocl.core.scene.fields import PSF_ERROR
@@ -89,17 +89,12 @@ def companions(
     least : float
         How significant a point must be.
     """
-    scene, beside, found = copy(estimate.scene), estimate, list[Companion]()
-    if scene.observation.psf_error:  # those that are fitted are doubted
-        error = max(scene.observation.psf_error, PSF_ERROR)
-        scene.observation = scene.observation.replace(psf_error=error)
-        beside = estimate = Estimate(scene, estimate.sky, estimate.star_fluxes)
+    beside = estimate = _doubted(estimate)
+    scene, found = estimate.scene, list[Companion]()
     width = Surroundings(estimate, False).width
     if width < NARROWEST:  # samples do not hold its shape
         return beside, found
-    light = estimate.star_fluxes[: scene.n_stars].reshape(-1, scene.n_epochs).sum(axis=1)
-    brightest = np.argsort(-light, kind="stable")[:MOST_STARS]
-    stars = (scene.n_epochs * brightest[light[brightest] > 0]).tolist()
+    stars = _brightest(estimate)
     while stars and len(found) < MOST_POINTS:
         around = Surroundings(beside, False, raised)
         likeliest = max((_likeliest(around, star) for star in stars), key=lambda each: each[-1])
@@ -117,16 +112,71 @@ def companions(
     return beside, found
 
 
+def errors_beside(estimate: Estimate, raised: Array | None = None) -> Array:
+    """Return the standard errors of points beside the brightest stars, beside all PSFs' errors.
+
+    They are medians at distances from a star, electrons, of the shape of the sky on its grid; 0
+    where no point is looked for.
+
+    Parameters
+    ----------
+    estimate : Estimate
+        That of a run with the stars that are known.
+    raised : ndarray of float64, shape (n_shapes,), optional
+        As of `companions`.
+    """
+    estimate = _doubted(estimate)
+    scene, errors = estimate.scene, np.zeros(estimate.scene.grid)
+    around = Surroundings(estimate, False, raised)
+    if around.width < NARROWEST:
+        return errors
+    for star in _brightest(estimate):
+        near = NearStar(around, star, FINISHED)
+        distance, is_tried = _places(around, near, star)
+        at = np.nonzero(is_tried)
+        found = _points(near, estimate, at)[1]
+        ring = np.round(STEPS * distance[at])
+        rings = np.unique(ring)
+        medians = [np.median(found[ring == k]) for k in rings]
+        is_near = (distance > NEAREST) & (distance <= FARTHEST)
+        profile = np.interp(STEPS * distance, rings, medians) if len(rings) else 0.0 * distance
+        there = near.places(scene)
+        errors[there] = np.maximum(errors[there], np.where(is_near, profile, 0.0) * scene.unit)
+    return errors
+
+
+def _doubted(estimate: Estimate) -> Estimate:
+    """Return an estimate whose PSFs, but for exact ones, are known no better than by default."""
+    scene = copy(estimate.scene)
+    error = scene.observation.psf_error
+    error = max(error, PSF_ERROR) if error else 0.0
+    scene.observation = scene.observation.replace(psf_error=error)
+    return Estimate(scene, estimate.sky, estimate.star_fluxes)
+
+
+def _brightest(estimate: Estimate) -> list[int]:
+    """Return the first epochs of the brightest stars."""
+    scene = estimate.scene
+    light = estimate.star_fluxes[: scene.n_stars].reshape(-1, scene.n_epochs).sum(axis=1)
+    brightest = np.argsort(-light, kind="stable")[:MOST_STARS]
+    return [int(scene.n_epochs * star) for star in brightest if light[star] > 0]
+
+
+def _places(around: Surroundings, near: NearStar, star: int) -> tuple[Array, Mask]:
+    """Return distances from a star in its window, resolutions, and where points are first tried."""
+    distance = np.hypot(*offsets_from(around.scene, star, near.window)) / near.resolution
+    is_tried, step = np.zeros(distance.shape, bool), round(near.resolution / STEPS)
+    is_tried[::step, ::step] = True
+    return distance, is_tried & (distance > NEAREST) & (distance <= FARTHEST)
+
+
 def _likeliest(around: Surroundings, star: int) -> Companion:
     """Return the likeliest point beside a star, its errors not known."""
     near, scene = NearStar(around, star, FINISHED), around.scene
     rows, columns = offsets_from(scene, star, near.window)
-    distance = np.hypot(rows, columns) / near.resolution
-    is_allowed = (distance > NEAREST) & (distance <= FARTHEST)
-    step = round(near.resolution / STEPS)
-    is_tried = np.zeros(distance.shape, bool)
-    is_tried[::step, ::step] = True
-    y, x = np.nonzero(is_tried & is_allowed)
+    distance, is_tried = _places(around, near, star)
+    is_allowed, step = (distance > NEAREST) & (distance <= FARTHEST), round(near.resolution / STEPS)
+    y, x = np.nonzero(is_tried)
     if not len(y):
         return Companion(scene.stars[star], 0.0, np.zeros(3), -np.inf)
     fluxes, errors = _points(near, around.estimate, (y, x))

@@ -210,7 +210,7 @@ class PsfErrors:
 
         Light beyond the file, which counts where images are larger, has the standard deviation that
         the edge of the PSF tells. A level of all pixels has that of its border, which it is part
-        of, or less: as a halo of the PSF may be as level, it holds at most `psf_error` of the light.
+        of. It holds at most `psf_error` of the light, as a halo of the PSF may be as level.
         """
         scene, (ny, nx) = self._estimate.scene, self._views[j].window.shape
         most = 2 * scene.oversample * ny, 2 * scene.oversample * nx
