@@ -23,7 +23,7 @@ from lnocl.core.scene.detector import on_sky
 from lnocl.core.scene.estimate import Estimate
 from lnocl.core.scene.quantities import in_unit
 from lnocl.core.scene.texture import SHARE_NEAR
-from lnocl.core.solvers.companions import errors_beside
+from lnocl.core.solvers.companions import SIGNIFICANT, errors_beside
 from lnocl.core.solvers.halos import halo_errors
 from lnocl.detection.score import Null
 from lnocl.detection.score_map import ScoreMap
@@ -150,8 +150,9 @@ class Significance:
         -------
         ndarray of float64, of the shape of the extended source
             Electrons; NaN where the images do not tell a source from stars. The extended source is
-            allowed for where it is: a point has to be three errors above what that may be, and near
-            a star above what PSFs may have wrong (`lnocl.core.solvers.companions`).
+            allowed for where it is: a point has to be three errors above what that may be. Near a
+            star it has to be five, or the threshold, above all that PSFs may have wrong, as points
+            are tried there (`lnocl.core.solvers.companions`).
 
         Raises
         ------
@@ -174,7 +175,8 @@ class Significance:
         number_in("completeness", completeness, "between 0 and 1", lambda given: 0 < given < 1)
         found, outcome = self._map, self._outcome
         fluxes = np.maximum(found.needed(self._at_threshold, completeness), self._told_from_source)
-        fluxes = np.maximum(fluxes, (CLEAR + norm.ppf(completeness)) * self._beside_psfs)
+        least = max(self.threshold, SIGNIFICANT) + norm.ppf(completeness)
+        fluxes = np.maximum(fluxes, least * self._beside_psfs)
         ny, nx = outcome.observation.sky_shape
         return np.asarray(fluxes[:ny, :nx])
 
