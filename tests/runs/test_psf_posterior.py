@@ -185,6 +185,15 @@ def test_several_stars_tell_of_one_psf_and_rounds_settle():
     assert abs(steps[-1]).max() < 0.15 * abs(steps[0]).max()
 
 
+@pytest.mark.parametrize(("wrong", "sky", "least", "most"), [(1.2, KNOTS, 4, 8), (1.0, 0, 1, 3)])
+def test_rounds_end_where_a_step_is_a_tenth_of_what_psfs_may_be_off(wrong, sky, least, most):
+    given, sky = [width / wrong for width in TRUE], np.broadcast_to(sky, (N, N))
+    steps = settle(observe(TRUE, given, sky=sky, exposure=DEPTHS, psf_error=0.03))
+    assert least <= len(steps) <= most
+    *before, last = (abs(each).max() for each in steps)
+    assert last < 0.1 <= min(before, default=1.0)
+
+
 def test_psfs_narrower_than_two_pixels_stay(monkeypatch):
     monkeypatch.setattr(psf_posterior, "ROUNDS", 1)
     widths, given = (1.8, 3.6), (1.7, 3.4)
