@@ -69,7 +69,8 @@ def test_there_is_none_where_the_images_do_not_tell_it(name, seed):
     assert zero_points(Scene(observation, STARS)) is None
 
 
-def test_a_star_that_varies_and_masked_ones_do_not_matter_beside_others():
+@pytest.mark.parametrize("epochs", [None, (0, 1, 2)])
+def test_a_star_that_varies_and_masked_ones_do_not_matter_beside_others(epochs):
     y, x = np.indices((100, 100))
     stars = np.array([(25.2, 24.0), (75.0, 26.4), (50.7, 50.1), (24.6, 75.3), (76.0, 74.0)])
     images = []
@@ -80,8 +81,15 @@ def test_a_star_that_varies_and_masked_ones_do_not_matter_beside_others():
         images.append(np.random.default_rng(j).poisson(LEVEL + factor * light))
     mask = np.hypot(x - stars[2, 0], y - stars[2, 1]) < 2.0
     psf = lopsided(20, 20, (41, 41))
-    scene = Scene(lnocl.Observation(images, psf, background=LEVEL, mask=mask), stars)
-    found = zero_points(scene)
+    observation = lnocl.Observation(images, psf, background=LEVEL, mask=mask, epochs=epochs)
+    found = zero_points(Scene(observation, stars))
     assert found.n_stars == 4
     assert found.values[0] == pytest.approx(np.log(0.8), abs=3.0 * found.errors[0])
     assert (found.values[1:] == 0.0).all()
+
+
+def test_images_of_several_epochs_need_three_stars():
+    """Two may vary alike."""
+    observation = observe(epochs=(0, 1, 2))
+    assert zero_points(Scene(observation, STARS)) is None
+    assert zero_points(Scene(observe(epochs=(0, 0, 0)), STARS)) is not None

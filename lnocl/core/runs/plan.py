@@ -25,6 +25,7 @@ from lnocl.core.scene.penalty import Penalty
 from lnocl.core.scene.psf_families import Family
 from lnocl.core.scene.star_psfs import owned, refuse_unowned
 from lnocl.core.scene.stars import check_positions
+from lnocl.core.scene.zero_points import FEWEST
 from lnocl.core.solvers import SolverName
 
 CORES, RAYS, EXPOSURES, LEVELS, PSFS, HALOS, PRIOR, CHOICE, STARS = STEPS = (
@@ -59,8 +60,9 @@ AUTO = Condition(lambda plan: plan.smoothing == "auto", "`smoothing` is a number
 MENDS = Condition(lambda plan: plan.mends, "`mend_images` is False")
 HAS_STARS = Condition(lambda plan: len(plan.setup.stars) > 0, "there are no stars")
 SEVERAL = Condition(lambda plan: plan.setup.observation.n_images > 1, "there is one image")
-ONE_EPOCH = Condition(
-    lambda plan: plan.setup.observation.n_epochs == 1, "stars may vary from epoch to epoch"
+STEADY_STARS = Condition(
+    lambda plan: plan.setup.observation.n_epochs == 1 or len(plan.setup.stars) >= FEWEST,
+    "fewer than three stars may vary from epoch to epoch",
 )
 SHOWS_PSFS = Condition(
     lambda plan: bool((owned(plan.setup.observation, plan.setup.stars) < 0).any()),
@@ -80,7 +82,7 @@ WHOLE = Condition(lambda plan: not plan.in_tiles, "the images are divided into t
 NEEDS: dict[str, tuple[Condition, ...]] = {
     CORES: (AUTO, MENDS, HAS_STARS),
     RAYS: (AUTO, MENDS),
-    EXPOSURES: (AUTO, MENDS, HAS_STARS, SEVERAL, ONE_EPOCH, NO_HALOS),
+    EXPOSURES: (AUTO, MENDS, HAS_STARS, SEVERAL, STEADY_STARS, NO_HALOS),
     LEVELS: (AUTO, HAS_ERROR, WHOLE),
     PSFS: (AUTO, HAS_STARS, SHOWS_PSFS),
     HALOS: (AUTO, HAS_HALOS),
@@ -139,7 +141,7 @@ class Plan:
     >>> print(lnocl.plan(obs, [(8, 5)]))
     mask saturated cores: yes
     mask cosmic rays: yes
-    fit exposures to stars: no, stars may vary from epoch to epoch
+    fit exposures to stars: no, fewer than three stars may vary from epoch to epoch
     fit levels of backgrounds: no, backgrounds have no error
     judge PSFs before the run: yes, and fit shift, jitter, pixels
     settle halos: no, there are no halos

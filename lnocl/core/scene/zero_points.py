@@ -4,6 +4,9 @@ Light is summed in circles round each star, the mean of a ring taken off, and di
 its PSF. The ratio of two images then hardly hangs on the shapes of PSFs, and not on what lies under
 the star. Circles of three sizes tell a zero point, which all have, from a PSF that is wrong, and
 from light beside the star, such as a cosmic ray, that one image has.
+
+In several epochs a star may vary. So there a zero point is that of three stars or more: of the one
+in the middle, by their scatter.
 """
 
 from __future__ import annotations
@@ -27,6 +30,8 @@ HIDDEN, LEFT = 0.05, 0.5
 # A zero point is used that is more than this, so many times its error, and the same in all circles
 # but for these shares, in the least and the largest beside the other, or so many errors.
 LEAST, SIGNIFICANT, ALIKE, APART = 0.03, 4.0, (0.5, 0.25), 3.0
+# Of several epochs, an image has so many good stars or no zero point.
+FEWEST = 3
 
 
 class ZeroPoints(NamedTuple):
@@ -47,7 +52,9 @@ class ZeroPoints(NamedTuple):
 
 def zero_points(scene: Scene) -> ZeroPoints | None:
     """Return the zero points that are used, 0 where none is; None where no image has one."""
-    measured = [_measured(scene, radius) for radius in CIRCLES]
+    fewest = FEWEST if scene.n_epochs > 1 else 1
+    # Few stars lie so far from others that the largest circle tells of them.
+    measured = [_measured(scene, *each) for each in zip(CIRCLES, (fewest, fewest, 1), strict=True)]
     found = [each for each in measured if each is not None]
     if len(found) < len(CIRCLES):
         return None
@@ -65,12 +72,16 @@ def zero_points(scene: Scene) -> ZeroPoints | None:
     return middle._replace(values=np.where(is_used, middle.values, 0.0))
 
 
-def _measured(scene: Scene, radius: float) -> ZeroPoints | None:
-    """Return the zero points in circles of so many widths; None where no star shows two."""
+def _measured(scene: Scene, radius: float, fewest: int) -> ZeroPoints | None:
+    """Return the zero points in circles of so many widths, of images of so many good stars or more.
+
+    None where no star shows two.
+    """
     fluxes, variances = _photometry(scene, radius)
     with np.errstate(invalid="ignore", divide="ignore"):
         relative = np.sqrt(variances) / fluxes
         is_good = (fluxes > 0) & (relative < FAINTEST)
+    is_good[is_good.sum(axis=1) < fewest] = False
     is_good[:, is_good.sum(axis=0) < 2] = False
     brightest = np.argsort(np.where(is_good, relative, np.inf).min(axis=0))[:MOST_STARS]
     stars = brightest[is_good[:, brightest].any(axis=0)]
@@ -109,11 +120,11 @@ def _photometry(scene: Scene, radius: float) -> tuple[Array, Array]:
     """Return fluxes and their variances, shape (p, n_stars); NaN where an image has none."""
     psfs, scales = seen_psfs(scene.observation), scene.observation.scales
     width = max(fwhm(psf) * scale for psf, scale in zip(psfs, scales, strict=True))
-    found = np.full((scene.n_images, scene.n_stars, 2), np.nan)
+    found = np.full((scene.n_images, scene.n_stars // scene.n_epochs, 2), np.nan)
     for j, scale in enumerate(scales):
         unit = max(width, LEAST_WIDTH) / scale
         for s in np.flatnonzero(scene.shown[: scene.n_stars, j] & (scene.owned < 0)).tolist():
-            found[j, s] = _of_star(scene, j, s, radius, unit)
+            found[j, s // scene.n_epochs] = _of_star(scene, j, s, radius, unit)
     return found[..., 0], found[..., 1]
 
 
