@@ -44,15 +44,15 @@ def targets(tmp_path, monkeypatch):
 def disturb(client, lost):
     """Kill one worker after the other, and cut the connection a little later."""
     lost += client.run(os.getpid).values()
-    for process, n_begun in zip(lost, (N_TARGETS // 3, N_TARGETS // 2), strict=True):
-        await_logs(n_begun)
+    for process, n_done in zip(lost, (N_TARGETS // 3, N_TARGETS // 2), strict=True):
+        await_results(n_done)
         os.kill(process, signal.SIGKILL)
-    await_logs(N_TARGETS * 2 // 3)
+    await_results(N_TARGETS * 2 // 3)
     client.loop.add_callback(client.scheduler_comm.comm.abort)
 
 
-def await_logs(number):
-    while len(list(Path("two").glob("*.log"))) < number:
+def await_results(number):
+    while len(list(Path("two").glob("*.fits"))) < number:
         time.sleep(0.01)
 
 
