@@ -38,9 +38,9 @@ from lnocl.process import ignored_notes, ignored_warnings
 
 # So many of the brightest stars tell of the PSFs.
 MOST_STARS = 4
-# Rounds of a run and of a step, at most, and the longest step and that which ends them, standard
+# Rounds of a run and of a step, at most; the longest step, and one that ends them, in standard
 # deviations of the prior.
-ROUNDS, MAX_STEP, SETTLED = 8, 6.0, 0.1
+ROUNDS, MAX_STEP, SETTLED = 3, 6.0, 0.1
 # What the `psf_error` of PSFs holds is an error of no more than so many times it.
 HELD = 2.0
 # The standard deviation of a place that is given, pixels.
