@@ -219,16 +219,17 @@ def test_light_beyond_a_file_is_an_unknown_where_images_are_larger():
     assert not slopes[N_SLOPES - 2].any()
 
 
-def test_a_level_of_a_file_is_an_unknown_as_bright_as_its_border():
-    share, clean = 0.04, lopsided(2.0, 41)
-    estimate = scene_of((1 - share) * clean + share / clean.size, psf_error=0.03)
+@pytest.mark.parametrize("share", [0.04, 0.2])
+def test_a_level_of_a_file_is_as_bright_as_its_border_but_for_more_than_the_error(share):
+    clean = lopsided(2.0, 41)
+    estimate = scene_of((1 - share) * clean + share / clean.size, psf_error=0.05)
     view = View(estimate.scene, 0)
     slopes, _ = PsfErrors(estimate, [view] * 3, {}).slopes(0, view.model(estimate))
     with_it, without = (
         each.scene.star_field.light(0, estimate.fluxes)
-        for each in (estimate, scene_of(clean, psf_error=0.03))
+        for each in (estimate, scene_of(clean, psf_error=0.05))
     )
-    expected = (1 - share) * (with_it - without)
+    expected = (1 - share) * (with_it - without) * min(0.05 / share, 1.0)
     found, most = slopes[N_SLOPES - 1], abs(expected).max()
     np.testing.assert_allclose(found, expected, rtol=0, atol=5e-3 * most)
     assert found[0, 0] == pytest.approx(expected[0, 0], rel=0.05)  # far from both stars
