@@ -4,13 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from kinds import NARROW, STARS
-from kinds import TRUE as CORE
-from kinds import observe as observe_kind
 from scipy.ndimage import gaussian_filter
 
 import lnocl
-from lnocl.core.runs import psf_posterior, psf_refinement
+from lnocl.core.runs import psf_posterior
 from lnocl.core.runs.outcome import PsfRefinement
 from lnocl.core.runs.psf_refinement import mend
 from lnocl.core.runs.start import Setup
@@ -186,27 +183,6 @@ def test_several_stars_tell_of_one_psf_and_rounds_settle():
     widths = [fwhm(after) / fwhm(psf(width)) for after, width in zip(found, given, strict=True)]
     assert widths == pytest.approx([1.1, 1.1], abs=0.02)
     assert abs(steps[-1]).max() < 0.15 * abs(steps[0]).max()
-
-
-def test_rounds_end_where_a_step_is_small(monkeypatch):
-    observation = observe(TRUE, TRUE, exposure=DEPTHS, psf_error=0.03)
-    first, *_, last = settle(observation)
-    monkeypatch.setattr(psf_posterior, "SETTLED", 1.1 * abs(first).max())
-    [only] = settle(observation)
-    np.testing.assert_array_equal(only, first)
-    assert abs(last).max() < 0.1 * abs(first).max()
-
-
-@pytest.mark.filterwarnings("ignore:the PSFs do not fit")
-@pytest.mark.parametrize(("rounds", "width"), [(1, 0.96), (4, 1.0)])
-def test_psfs_that_do_not_fit_are_settled_again(rounds, width, monkeypatch):
-    """Once, cores that are 8 % too narrow stay 4 % so, in which a star is 8 % too faint."""
-    monkeypatch.setattr(psf_refinement, "ROUNDS", rounds)
-    observation, wide = (observe_kind("turned + star PSFs", xx)[0] for xx in (NARROW, CORE))
-    observation = observation.replace(psf_error=0.03)
-    found = mend(setup_of(observation, STARS), ("shift",), False, False).setup.observation.psfs
-    widths = [fwhm(each) / fwhm(true) for each, true in zip(found, wide.psfs, strict=True)]
-    assert widths == pytest.approx([width] * 2, abs=0.01)
 
 
 def test_psfs_narrower_than_two_pixels_stay(monkeypatch):

@@ -38,9 +38,8 @@ from lnocl.process import ignored_notes, ignored_warnings
 
 # So many of the brightest stars tell of the PSFs.
 MOST_STARS = 4
-# Rounds of a run and of a step, at most; the longest step, and one that ends them, in standard
-# deviations of the prior.
-ROUNDS, MAX_STEP, SETTLED = 3, 6.0, 0.1
+# Rounds of a run and of a step, and the longest step, standard deviations of the prior.
+ROUNDS, MAX_STEP = 3, 6.0
 # What the `psf_error` of PSFs holds is an error of no more than so many times it.
 HELD = 2.0
 # The standard deviation of a place that is given, pixels.
@@ -60,7 +59,7 @@ def settle_psfs(
     shifts are left to the positions, and zero points as they are given. So are wings: what is not
     the extended source's is told from it by its smoothness alone, and each round would hand it more
     of them. PSFs narrower than two of their pixels are left, as their samples do not hold their
-    shape. Rounds end where a step is less than `SETTLED`. No step follows a run that diverges.
+    shape. No step follows a run that diverges.
 
     Parameters
     ----------
@@ -85,8 +84,7 @@ def settle_psfs(
             estimate = run_steadily(start, penalty, N_ITER, tick).estimate
             found, away = _mean(estimate, theta, moves)
             step = np.where(is_sampled[:, None], found - theta, 0.0)
-            longest = float(abs(step).max())
-            steps.append(step * MAX_STEP / max(longest, MAX_STEP))
+            steps.append(step * MAX_STEP / max(float(abs(step).max()), MAX_STEP))
             theta = theta + steps[-1]
             setup = replace(
                 setup,
@@ -95,8 +93,6 @@ def settle_psfs(
                 initial_extended=np.maximum(estimate.observed_sky, 0.0),
                 initial_star_fluxes=estimate.star_fluxes[: estimate.scene.n_stars],
             )
-            if longest < SETTLED and not away.any():
-                break
     return steps, setup.stars
 
 

@@ -209,24 +209,7 @@ def _shows_pixels(misfit: PsfMisfit) -> bool:
 
 
 def _settle(runs: GuardedRuns, state: _State, moves: bool) -> _State:
-    """Return the state with PSFs that are the mean of what they may be, unless they fit worse.
-
-    What does not fit then is settled again, as long as it fits better: PSFs that fit would hand
-    more and more of their wings to the extended source.
-    """
-    settled = _settle_once(runs, state, moves)
-    for _ in range(ROUNDS - 1):
-        if settled is state or not settled.misfit.is_doubtful:
-            break
-        again = _settle_once(runs, settled, moves)
-        if settled.misfit.significance - again.misfit.significance < GONE:
-            break
-        settled = again
-    return settled
-
-
-def _settle_once(runs: GuardedRuns, state: _State, moves: bool) -> _State:
-    """Return the state after some rounds, unless it fits worse or a star fades."""
+    """Return the state with PSFs that are the mean of what they may be, unless they fit worse."""
     places = state.estimate.scene.places
     psfs, stars = runs.settled(state.psfs, places, moves)
     is_moved = bool((stars != places).any())
