@@ -6,6 +6,9 @@ import numpy as np
 import pytest
 
 import lnocl
+from lnocl.core.runs.companions import beside_stars
+from lnocl.core.runs.guarded_runs import GuardedRuns
+from lnocl.core.runs.start import Setup
 from lnocl.core.scene.estimate import Estimate
 from lnocl.core.scene.forward_model import Model
 from lnocl.core.scene.scene import Scene
@@ -171,3 +174,17 @@ def test_a_companion_that_is_not_named_stays_out_of_the_psf(caplog):
     is_near = np.hypot(X - place[0], Y - place[1]) < 2.4
     assert result.extended[is_near].sum() == pytest.approx(flux, rel=0.12)
     assert abs(result.star_fluxes[0] - FLUX) < 2 * result.star_flux_errors[0]
+
+
+def test_points_are_looked_for_through_psfs_without_the_noise_of_their_wings(monkeypatch):
+    observation, seen = observe(), []
+    noise = 2e-4 * np.random.default_rng(2).standard_normal(observation.psfs.shape)
+    noisy = observation.replace(psfs=observation.psfs + noise)
+    monkeypatch.setattr(
+        GuardedRuns, "setup_of", lambda runs, psfs, _: seen.append(psfs) or runs._setup
+    )
+    for each in (observation, noisy):
+        beside_stars(Setup(each, np.array([STAR]), 0, "sgp", "double", "numpy", None))
+    np.testing.assert_array_equal(seen[0], observation.psfs)
+    assert noisy.psfs.min() < -1e-4
+    assert seen[1].min() >= 0
