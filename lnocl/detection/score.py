@@ -42,6 +42,7 @@ from lnocl.core.scene.psf_pixels import CORRELATED
 from lnocl.core.scene.scene import MIN_MODEL
 from lnocl.core.scene.smooth_field import SmoothField
 from lnocl.core.scene.texture import ROUND, coarseness, resolution
+from lnocl.core.scene.threads import threads
 from lnocl.detection.known_stars import KnownStars
 from lnocl.detection.maxima import SIGNIFICANT
 from lnocl.detection.score_noise import noise_of
@@ -395,7 +396,7 @@ class Null:
         told = []
         for j, part in enumerate(self._powers(linear.precisions, 2, width)):
             part = np.maximum(self.scene.scale * part, 0.0)  # but for rounding
-            power = abs(scipy.fft.fft2(self.kernel(j, width), workers=-1)) ** 2
+            power = abs(scipy.fft.fft2(self.kernel(j, width), workers=threads(grid))) ** 2
             power /= power.sum()
             noise = power * high**2
             moments = [(noise * k).sum() for k in frequencies]
@@ -409,7 +410,7 @@ class Null:
         shares = np.divide(sums, total, out=np.zeros_like(sums), where=total > 0)
         area = np.where(total > 0, shares[2], 1.0)
         yy, yx, xx = shares[3:] / (1.0 - shares[1])
-        correlation = scipy.fft.ifft2(correlation, workers=-1).real
+        correlation = scipy.fft.ifft2(correlation, workers=threads(grid)).real
         return total, _Spectral(
             shares[0] / area,
             shares[1] / area,
@@ -496,5 +497,5 @@ def _blurred(values: Array, width: float) -> Array:
     deviation = width / FWHM
     v, u = np.fft.fftfreq(values.shape[0])[:, None], np.fft.rfftfreq(values.shape[1])
     transfer = np.exp(-2.0 * (math.pi * deviation) ** 2 * (v**2 + u**2))
-    spectrum = scipy.fft.rfft2(values, workers=-1) * transfer
-    return np.asarray(scipy.fft.irfft2(spectrum, values.shape, workers=-1))
+    spectrum = scipy.fft.rfft2(values, workers=threads(values.shape)) * transfer
+    return np.asarray(scipy.fft.irfft2(spectrum, values.shape, workers=threads(values.shape)))

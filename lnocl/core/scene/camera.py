@@ -28,6 +28,7 @@ from lnocl.core.scene.line_weights import TAPS
 from lnocl.core.scene.rotation import Rotation
 from lnocl.core.scene.scene import Scene
 from lnocl.core.scene.shifting import Window, window
+from lnocl.core.scene.threads import threads
 
 Spectrum = NDArray[np.complex128]
 # Rows and columns of the images' grid, or of the sky's, without an end.
@@ -53,7 +54,6 @@ class LinearMap:
     _sky: Part = ...  # where the sky lies in it
     _seen: Part = ...  # where the image does
     _oversample = 1
-    _workers: int | None = None
     transmission: Array | None = None
 
     def forward(self, sky: Array) -> Array:
@@ -99,11 +99,11 @@ class LinearMap:
         if there is not ...:
             laid = np.zeros(self._grid)
             laid[there] = values
-        return np.asarray(scipy.fft.rfft2(laid, workers=self._workers))
+        return np.asarray(scipy.fft.rfft2(laid, workers=threads(self._grid)))
 
     def _pixels(self, spectrum: Spectrum) -> Array:
-        pixels = scipy.fft.irfft2(spectrum, self._grid, workers=self._workers, overwrite_x=True)
-        return np.asarray(pixels)
+        workers = threads(self._grid)
+        return np.asarray(scipy.fft.irfft2(spectrum, self._grid, workers=workers, overwrite_x=True))
 
 
 class Camera(LinearMap):
@@ -133,8 +133,6 @@ class Camera(LinearMap):
         What a flat sky of ones is in the image, and a flat image of ones in the sky: both stay
         flat, but for a transmission.
     """
-
-    _workers = -1
 
     def __init__(self, scene: Scene, j: int, is_kept: bool = True) -> None:
         self._is_kept = is_kept

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from lnocl.core.scene.arrays import Array
+from lnocl.core.scene.threads import threads
 
 
 class SmoothField:
@@ -21,7 +22,7 @@ class SmoothField:
     """
 
     def __init__(self, shape: tuple[int, ...], width: float) -> None:
-        self._shape = shape
+        self._shape, self._threads = shape, threads(shape)
         u, v = np.fft.rfftfreq(shape[1]), np.fft.fftfreq(shape[0])[:, None]
         root = np.exp(-((np.pi * width) ** 2) * (u**2 + v**2))
         self._root = root / np.sqrt(np.fft.irfft2(root**2, shape)[0, 0])
@@ -30,5 +31,5 @@ class SmoothField:
         """Return the field of x, shape (ny, nx)."""
         from scipy import fft  # which the start of a command need not load
 
-        spectrum = self._root * fft.rfft2(x, workers=-1)
-        return np.asarray(fft.irfft2(spectrum, self._shape, workers=-1), np.float64)
+        spectrum = self._root * fft.rfft2(x, workers=self._threads)
+        return np.asarray(fft.irfft2(spectrum, self._shape, workers=self._threads), np.float64)

@@ -28,6 +28,7 @@ from lnocl.core.scene.estimate import Estimate
 from lnocl.core.scene.forward_model import Model
 from lnocl.core.scene.psf_families import PsfFamilies, PsfParameters, Spectrum, spectrum
 from lnocl.core.scene.psf_pixels import PsfPixels
+from lnocl.core.scene.threads import threads
 from lnocl.core.scene.view import View
 from lnocl.core.solvers.fluxes import MAX_FADING
 from lnocl.core.solvers.least_squares import Field, LeastSquares, LinearImage, SourceError
@@ -190,13 +191,14 @@ class _PixelErrors:
     def forward(self, x: Array) -> Iterator[Array]:
         for j, (field, sky) in enumerate(zip(x, self._skies, strict=True)):
             change = spectrum(self._pixels.correction(j, field), self._grid)
-            seen = scipy.fft.irfft2(change * sky, self._grid, workers=-1)
+            seen = scipy.fft.irfft2(change * sky, self._grid, workers=threads(self._grid))
             yield sampled(seen, self._oversample)
 
     def adjoint(self, images: Sequence[Array]) -> Array:
-        fields = np.empty_like(self.at)
+        fields, workers = np.empty_like(self.at), threads(self._grid)
         for j, (image, sky) in enumerate(zip(images, self._skies, strict=True)):
-            back = sky.conj() * scipy.fft.rfft2(spread(image, self._oversample), workers=-1)
-            of_psf = scipy.fft.irfft2(back, self._grid, workers=-1)[self._places]
+            of_image = scipy.fft.rfft2(spread(image, self._oversample), workers=workers)
+            back = sky.conj() * of_image
+            of_psf = scipy.fft.irfft2(back, self._grid, workers=workers)[self._places]
             fields[j] = self._pixels.adjoint(j, of_psf)
         return fields
