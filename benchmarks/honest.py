@@ -206,17 +206,17 @@ def zero_points(rng, each_night=False, n=48):
     return Scene(images, psfs, known, stars, np.repeat(fluxes, 6 if each_night else 1), 3e4)
 
 
-def epochs(rng, off=(3.0, -4.0), made=None, nights=6, n=64):
+def epochs(rng, off=(3.0, -4.0), made=None, nights=6, n=64, light=1e5):
     """Return nights of a star on or off the nucleus of a host, each with a PSF and depth."""
     star, images, psfs = middle(rng, n), [], []
     fluxes, depths = 3e4 * rng.uniform(0.8, 1.2, nights), rng.uniform(0.6, 1.4, nights)
-    sky = blob(n, 1e5, star - off, 8.5, ratio=2.0)
+    sky = blob(n, light, star - off, 8.5, ratio=2.0)
     for flux, depth in zip(fluxes, depths, strict=True):
         true = psf(41, rng.uniform(3.0, 4.2), skew=0.1, stretch=1.1)
         images.append(rng.poisson(100 + depth * seen(n, true, star, [flux], sky)))
         psfs.append(true if made is None else made(rng, true))
     known = {"background": 100.0, "epochs": range(nights), "exposure": depths}
-    return Scene(images, psfs, known, [star], fluxes, 1e5)
+    return Scene(images, psfs, known, [star], fluxes, light)
 
 
 def of_stars(rng, true, n_stars=3, flux=1e5, vary=0.0):
@@ -336,6 +336,8 @@ LINES = {
     "epochs-off-nucleus": epochs,
     "epochs-on-nucleus": partial(epochs, off=(0.0, 0.0)),
     "curves-made-psfs": partial(epochs, made=of_stars),
+    "curves-20-alone": partial(epochs, made=of_stars, nights=20, light=0.0),
+    "curves-20-host": partial(epochs, made=of_stars, nights=20),
     "rolls-wide": rolls,
     "rolls-narrow": partial(rolls, wrong=0.95),
     "tiles": tiles,

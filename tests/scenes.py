@@ -37,6 +37,14 @@ FEWER_ENGINES = _later("double")
 NUMPY_FIRST = _later("opencl")
 
 
+def named(cases, *fast):
+    """Return parameters with names, of which CI alone tests all but some."""
+    return [
+        pytest.param(case, id=name, marks=[] if name in fast else [pytest.mark.exhaustive])
+        for name, case in cases.items()
+    ]
+
+
 def make_psfs(n_images, shape):
     """Return PSFs that have no symmetry and no two of which are equal, centroids off centre."""
     y, x = np.indices(shape)

@@ -49,6 +49,7 @@ def test_code_fits_its_budget_which_falls_with_it(part):
     assert found > BUDGET[part] - 100, "lower the budget"
 
 
+@pytest.mark.exhaustive
 def test_the_core_knows_neither_files_nor_pictures_nor_clusters():
     outside = (*OUTSIDE, *(f"lnocl.{room}" for room in ROOMS_OUTSIDE))
     knowing = {

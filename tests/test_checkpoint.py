@@ -89,6 +89,7 @@ def test_checkpoints_do_not_change_the_run(solver, engine, tmp_path, monkeypatch
     assert_same(made.deconvolve(**given, checkpoint=path), made.deconvolve(**given))
 
 
+@pytest.mark.exhaustive
 def test_a_run_cut_off_where_no_step_was_left_for_the_stars_as_they_were_goes_on(
     tmp_path, monkeypatch
 ):
@@ -237,6 +238,7 @@ def test_another_device_version_or_tuning_is_refused(saved, tmp_path):
             STARS.make().deconvolve(n_iter=6, engine="numpy", resume=path)
 
 
+@pytest.mark.exhaustive
 @pytest.mark.filterwarnings("ignore::lnocl.LnoclWarning")
 @pytest.mark.parametrize("share", [6, pytest.param(1, marks=pytest.mark.exhaustive)])
 def test_nothing_truncated_or_altered_is_gone_on_from(share, saved, tmp_path):

@@ -116,6 +116,7 @@ def test_without_a_client_there_is_no_current_scheduler():
         next(work(Squares, [1], CURRENT))
 
 
+@pytest.mark.exhaustive
 def test_processes_of_its_own_end_with_the_work(monkeypatch):
     close = distributed.LocalCluster.close
 
@@ -133,6 +134,7 @@ def test_processes_of_its_own_end_with_the_work(monkeypatch):
             os.kill(pid, 0)
 
 
+@pytest.mark.exhaustive
 def test_workers_hold_what_does_the_tasks(client):
     answers = list(work(partial(Squares, 0.2), range(20), CURRENT))
     assert [each[0] for each in answers] == [k**2 for k in range(20)]
@@ -143,6 +145,7 @@ def test_workers_hold_what_does_the_tasks(client):
         assert counts == list(range(1, pids.count(pid) + 1))
 
 
+@pytest.mark.exhaustive
 def test_a_worker_that_is_killed_and_a_connection_that_is_cut_cost_no_task(client):
     found = []
     for square, pid, _ in work(partial(Squares, 0.02), range(60), CURRENT):
@@ -171,6 +174,7 @@ def count_tasks(dask_scheduler):
     return len(dask_scheduler.tasks)
 
 
+@pytest.mark.exhaustive
 def test_tasks_that_are_left_are_cancelled(client):
     with closing(work(partial(Squares, 0.3), range(1000), CURRENT)) as answers:
         next(answers)
@@ -216,6 +220,7 @@ def test_work_inside_a_task_is_refused(client, inner):
         list(work(make_nested, [inner], CURRENT))
 
 
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("is_file", [True, False])
 def test_a_script_that_processes_cannot_read_is_told(tmp_path, is_file):
     script = "from lnocl.parallel import work\ndef make():\n    return abs\n"

@@ -193,6 +193,7 @@ def test_a_jet_limits_points_on_it(found):
     assert limits[46, 20] > 3 * limits[6, 55]
 
 
+@pytest.mark.exhaustive
 def test_sources_at_the_limit_are_found_as_often_as_it_says():
     """40 of them, so that the share has an error of 8 %; a limit twice as faint finds few."""
     found = solve(point(*STAR, 1e5), [STAR], 1).significance(false_alarms=0.1)

@@ -154,6 +154,7 @@ def test_the_shell_takes_tiles_where_psfs_vary_and_tiles_take_the_images(known, 
 # --- Stars through the PSFs of their own places
 
 
+@pytest.mark.exhaustive
 @pytest.mark.filterwarnings("ignore:the noise of image", "ignore:neighbouring pixels")
 @pytest.mark.filterwarnings("ignore:psf 1 varies")
 @pytest.mark.parametrize("solver", ["sgm", "sgp"])
@@ -266,6 +267,7 @@ def make_frame(seed=0, n_images=1, psf=None, n_stars=9, size=N):
     return lnocl.Observation(counts, psf, background=5.0), stars
 
 
+@pytest.mark.exhaustive
 @pytest.mark.parametrize(
     ("run", "n_stars", "middle", "blends"),
     [
@@ -301,6 +303,7 @@ def test_tiles_are_the_whole(run, n_stars, middle, blends):
     assert len(result.star_residuals()) == len(stars)
 
 
+@pytest.mark.exhaustive
 def test_one_tile_is_the_whole_bit_for_bit():
     observation, stars = make_frame()
     run = {"n_iter": 20, "smoothing": 0.01, **RUN}
@@ -357,6 +360,7 @@ def test_families_that_are_named_are_fitted_before_tiles_are_cut(narrow):
     np.testing.assert_array_equal(found.psfs, whole.psfs)
 
 
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("is_wrong", [True, pytest.param(False, marks=pytest.mark.exhaustive)])
 def test_one_tile_is_judged_as_the_whole_is(is_wrong, narrow):
     observation, stars, _, whole = narrow
@@ -369,6 +373,7 @@ def test_one_tile_is_judged_as_the_whole_is(is_wrong, narrow):
         np.testing.assert_array_equal(getattr(result, name), getattr(whole, name), name)
 
 
+@pytest.mark.exhaustive
 @pytest.mark.filterwarnings("ignore:the PSFs do not fit the stars, by 30 %")
 @pytest.mark.parametrize("tile", [48, 128])
 def test_a_weight_that_is_given_stays_in_tiles_beside_a_scatter_of_psfs(tile):
@@ -407,6 +412,7 @@ def test_tiles_come_near_a_psf_for_each_pixel():
     assert errors[1] < 0.03
 
 
+@pytest.mark.exhaustive
 def test_all_tiles_take_what_the_brightest_chooses():
     observation, stars = make_frame(n_stars=4)
     run = {key: RUN[key] for key in ("engine", "precision")}
@@ -429,6 +435,7 @@ def test_light_of_stars_makes_no_tile_bright():
     assert tiles._light(tile._replace(stars=np.zeros((0, 2)))) > 9e6
 
 
+@pytest.mark.exhaustive
 def test_masked_tiles_are_dark_and_stars_keep_their_order():
     observation, stars = make_frame()
     images = np.array(observation.images)
@@ -480,6 +487,7 @@ def test_images_that_are_shifted_are_seen_whole_by_tiles():
     assert result.fit().rms == pytest.approx(whole.fit().rms, rel=0.01)
 
 
+@pytest.mark.exhaustive
 def test_a_star_in_a_masked_tile_is_refused_and_one_beside_it_is_not():
     observation, stars = make_frame(n_stars=6)
     bad = np.zeros((N, N), bool)
@@ -547,6 +555,7 @@ def test_tiles_have_no_replicas():
         result.bootstrap()
 
 
+@pytest.mark.exhaustive
 def test_what_tiles_say_is_summed_up():
     observation, stars = make_frame(n_stars=12)
     bad = np.zeros((N, N), bool)
@@ -584,6 +593,7 @@ def stpsf_file(oversample=1):
     return keywords | {"OVERSAMP": oversample}, psfs
 
 
+@pytest.mark.exhaustive
 @pytest.mark.filterwarnings("ignore:the PSFs do not fit the stars, by 12 %")
 def test_a_grid_of_psfs_is_taken_tile_by_tile(tmp_path, monkeypatch, capsys):
     pytest.importorskip("photutils", reason="photutils is not installed")
@@ -603,6 +613,7 @@ def test_a_grid_of_psfs_is_taken_tile_by_tile(tmp_path, monkeypatch, capsys):
     assert cli.main([*words, "--overwrite", "--pad", "4"]) == 0  # without being told
 
 
+@pytest.mark.exhaustive
 def test_stdpsf_files_are_read(tmp_path, monkeypatch):
     pytest.importorskip("photutils", reason="photutils is not installed")
     monkeypatch.chdir(tmp_path)

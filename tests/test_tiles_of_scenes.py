@@ -144,6 +144,7 @@ def test_cores_of_tiles_are_the_images_that_were_simulated(kind):
 RUN = {"engine": "numpy", "stop": None, "smoothing": 0.02}
 
 
+@pytest.mark.exhaustive
 def test_stars_of_tiles_have_a_flux_in_each_epoch():
     observation, _, _ = observe("epochs")
     run = RUN | {"n_iter": 10}
@@ -198,6 +199,7 @@ def test_tiles_are_the_whole_and_the_sky_that_was_simulated(kind):
     assert found.fit().rms == pytest.approx(whole.fit().rms, rel=0.01)
 
 
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("epochs", [None, [0, 1]])
 def test_tiles_warn_of_their_own_stars_alone(epochs):
     """A neighbour's lies in the corner of what is seen of a turned image, and beyond the other."""

@@ -42,6 +42,7 @@ def summary():
 GOOD = ('one,a.fits,k1.fits,"7,5 3.5,2",3', 'two,a.fits b.fits,k1.fits k2.fits,"7,5",2')
 
 
+@pytest.mark.exhaustive
 def test_each_target_is_what_its_command_gives(capsys):
     write_targets(*GOOD)
     assert batch() == 0
@@ -160,6 +161,7 @@ def test_the_longest_name_of_a_file():
     assert os.path.exists(f"out/{name}.fits")
 
 
+@pytest.mark.exhaustive
 def test_what_is_done_is_not_done_again(capsys):
     write_targets("late,c.fits,k1.fits,,2", *GOOD)
     assert batch("--quiet") == 1
@@ -174,6 +176,7 @@ def test_what_is_done_is_not_done_again(capsys):
     assert os.stat("out/one.fits").st_mtime_ns != before["one.fits"]
 
 
+@pytest.mark.exhaustive
 def test_what_another_command_has_made_stays(capsys):
     write_targets(*GOOD)
     assert batch("--quiet") == 0
@@ -193,6 +196,7 @@ def test_what_another_command_has_made_stays(capsys):
     assert summary()["one"]["n_iter"] == 4
 
 
+@pytest.mark.exhaustive
 def test_job_arrays_share_the_targets():
     rows = [f"t{k},a.fits,k1.fits,,1" for k in range(5)]
     write_targets(*rows)
@@ -282,6 +286,7 @@ def test_names_that_leave_the_folder_are_rows_that_fail():
     assert "its name '../up' cannot be that of a file" in summary()["row1"]["message"]
 
 
+@pytest.mark.exhaustive
 def test_the_picture_shows_what_is_done(capsys):
     pytest.importorskip("matplotlib")
     from matplotlib.image import imread
@@ -295,6 +300,7 @@ def test_the_picture_shows_what_is_done(capsys):
     assert "page.png exists" in capsys.readouterr().err
 
 
+@pytest.mark.exhaustive
 def test_an_interrupt_ends_it_and_the_next_call_goes_on():
     write_targets(GOOD[0], 'long,cube.fits,psfs.fits,"7,5",1000000', GOOD[1])
     words = [sys.executable, "-m", "lnocl", "batch", "targets.csv", "-o", "out"]

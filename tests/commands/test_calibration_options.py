@@ -76,6 +76,7 @@ class TestFrames:
     def run(self, *options, output="out.fits"):
         return cli.main(["deconvolve", *self.INPUTS, *NUMPY, *options, "-o", output])
 
+    @pytest.mark.exhaustive
     def test_the_command_in_the_header_makes_the_same_file_bit_by_bit(self, capsys):
         assert self.run(*self.OPTIONS, *self.sky_option) == 0
         captured = capsys.readouterr()
@@ -108,6 +109,7 @@ class TestFrames:
             np.testing.assert_equal(again[name], data)
         assert fits.getheader("out.fits")["HISTORY"] == header["HISTORY"]
 
+    @pytest.mark.exhaustive
     def test_it_is_what_the_library_makes_of_the_files(self):
         assert self.run(*self.OPTIONS, *self.sky_option, "--quiet") == 0
         known = Calibration(
@@ -160,6 +162,7 @@ class TestFrames:
         unknown = observation.mask | (found["MODELS"] == 0)
         np.testing.assert_array_equal(np.isnan(found["RESIDUALS"]), unknown)
 
+    @pytest.mark.exhaustive
     def test_units_and_cards_of_the_result(self):
         assert self.run(*self.OPTIONS, *self.sky_option) == 0
         with fits.open("out.fits") as hdus:
@@ -216,6 +219,7 @@ class TestFrames:
         )
         assert len(header["ESUM1"]) == len(header["RSUM1"]) == 64
 
+    @pytest.mark.exhaustive
     def test_what_was_done_is_said_unless_it_is_quiet(self, capsys):
         assert self.run(*self.OPTIONS, *self.sky_option) == 0
         said = capsys.readouterr()

@@ -113,6 +113,7 @@ class TestDeconvolve:
             )
             assert 15 < darkest < 25
 
+    @pytest.mark.exhaustive
     def test_what_was_tried_is_not_advised(self, capsys):
         inputs = ("a.fits", "b.fits", "--psf", "k1.fits", "--refine-psfs", "pixels")
         assert cli.main(["deconvolve", *inputs, *NUMPY, *self.ARGUMENTS, "-o", "out.fits"]) == 0
@@ -158,6 +159,7 @@ class TestDeconvolve:
         said = "it ended after 0 iterations: there is little but noise" in capsys.readouterr().out
         assert said == (n_iter > 1)
 
+    @pytest.mark.exhaustive
     def test_what_the_device_must_hold_is_said_first(self, capsys):
         assert run("--n-iter", "1", engine=()) == 0
         name = re.escape(device.describe(device.choose().device))
@@ -175,6 +177,7 @@ class TestDeconvolve:
         assert of_psf.endswith(" of the light of a PSF at most")
         assert of_fit == "lnocl: warning: the model does not fit: see to background, noise and gain"
 
+    @pytest.mark.exhaustive
     @pytest.mark.parametrize(
         "name",
         [

@@ -62,6 +62,7 @@ def test_detections_are_said_written_and_added(output, capsys):
         assert hdus["DETECTIONS"].header["FALSALRM"] == 0.01
 
 
+@pytest.mark.exhaustive
 def test_detections_and_limits_begin_at_once(monkeypatch, capsys):
     """They are those of a file of before, which has to make its run again."""
     commands = ["detect", "out.fits"], ["limit", "out.fits", "--injections", "4"]
@@ -78,6 +79,7 @@ def test_detections_and_limits_begin_at_once(monkeypatch, capsys):
     np.testing.assert_equal(found[1], found[0])
 
 
+@pytest.mark.exhaustive
 def test_detections_replace_those_that_are_there(capsys):
     for alarms in ("0.01", "1"):
         assert cli.main(["detect", "out.fits", "--false-alarms", alarms, "--quiet"]) == 0
@@ -88,6 +90,7 @@ def test_detections_replace_those_that_are_there(capsys):
         assert hdus["DETECTIONS"].header["FALSALRM"] == 1.0
 
 
+@pytest.mark.exhaustive
 def test_limits_are_said_written_added_and_checked(capsys):
     words = ["limit", "out.fits", "-o", "limits.ecsv", "--injections", "11"]
     assert cli.main(words) == 0
@@ -113,6 +116,7 @@ def test_no_sources_are_put_in_where_none_are_wanted(capsys):
     assert "put in" not in capsys.readouterr().out
 
 
+@pytest.mark.exhaustive
 def test_a_limit_that_is_too_faint_is_told(capsys, monkeypatch):
     from lnocl.significance import Significance
 
@@ -122,6 +126,7 @@ def test_a_limit_that_is_too_faint_is_told(capsys, monkeypatch):
     assert "the limit of 90 % is too faint: of 20 sources put in" in capsys.readouterr().err
 
 
+@pytest.mark.exhaustive
 def test_pictures_and_the_report_show_them(capsys):
     pytest.importorskip("matplotlib")
     assert cli.main(["detect", "out.fits", "--plot", "found.png"]) == 0
@@ -144,6 +149,7 @@ def test_a_report_without_them_has_no_section():
     assert "Detections and limits" not in Path("page.html").read_text()
 
 
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("unit", ["adu", "MJy / sr"])
 def test_fluxes_are_in_the_unit_of_the_images(unit, capsys):
     with fits.open("image.fits", mode="update") as hdus:
@@ -160,6 +166,7 @@ def test_fluxes_are_in_the_unit_of_the_images(unit, capsys):
     assert fits.getheader("adu.fits", "DETECTIONS")["FLUXUNIT"] == unit.replace(" ", "")
 
 
+@pytest.mark.exhaustive
 def test_a_star_without_light_has_no_limit_beside_it(capsys):
     pytest.importorskip("matplotlib")
     fits.writeto("flat.fits", np.full((N, N), 50.0))
@@ -171,6 +178,7 @@ def test_a_star_without_light_has_no_limit_beside_it(capsys):
     assert cli.main(["report", "dark.fits", "-o", "page.html"]) == 0
 
 
+@pytest.mark.exhaustive
 def test_a_file_that_is_not_standard_gets_its_detections(capsys):
     """One that lacks its last padding, and has a card that astropy does not write."""
     with fits.open("out.fits") as hdus:
@@ -193,6 +201,7 @@ def test_a_result_whose_stars_are_gone_is_another(capsys):
     assert "the run of out.fits gives another result now" in capsys.readouterr().err
 
 
+@pytest.mark.exhaustive
 def test_a_command_without_its_folder_is_made_where_one_is(capsys):
     content = Path("out.fits").read_bytes()
     at = content.index(b"HISTORY cd")

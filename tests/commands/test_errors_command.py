@@ -86,6 +86,7 @@ def test_errors_are_added_to_the_file(words, capsys):
     assert lnocl.io.saved_results.read_result("out.fits").extended.shape == (64, 64)
 
 
+@pytest.mark.exhaustive
 @pytest.mark.usefixtures("result")
 def test_regions_are_said_before_stars_and_all_of_them(capsys, monkeypatch):
     monkeypatch.setattr("lnocl.commands.errors.MAX_LISTED", 2)
@@ -97,6 +98,7 @@ def test_regions_are_said_before_stars_and_all_of_them(capsys, monkeypatch):
     ]  # fmt: skip
 
 
+@pytest.mark.exhaustive
 @pytest.mark.usefixtures("quick_figures", "result")
 def test_profiles_are_drawn_with_their_errors(capsys):
     pytest.importorskip("matplotlib")
@@ -123,6 +125,7 @@ def test_profiles_are_drawn_with_their_errors(capsys):
     assert (outer.y0, outer.y1) == pytest.approx((flux["low95"].min(), flux["high95"].max()))
 
 
+@pytest.mark.exhaustive
 def test_errors_go_on_bit_for_bit_as_if_computed_at_once(words):
     """The command in the header says where files are, names beyond ASCII and all."""
     os.rename("psfs.fits", "pśf.fits")
@@ -143,6 +146,7 @@ def test_errors_go_on_bit_for_bit_as_if_computed_at_once(words):
     same_errors(held(), expected)
 
 
+@pytest.mark.exhaustive
 @pytest.mark.usefixtures("result")
 def test_a_result_without_errors_is_given_them(capsys):
     before, headers = Path("out.fits").read_bytes(), held()
@@ -162,6 +166,7 @@ def test_a_result_without_errors_is_given_them(capsys):
     np.testing.assert_array_equal(found["PRIMARY"].data, fits.getdata("first.fits"))
 
 
+@pytest.mark.exhaustive
 def test_errors_are_in_the_unit_of_the_result(words):
     """Per second, of images in electrons with an exposure; and go on in it."""
     fits.setval("images.fits", "BUNIT", value="adu")
@@ -185,6 +190,7 @@ def test_errors_are_in_the_unit_of_the_result(words):
     assert len(replicas) == 11
 
 
+@pytest.mark.exhaustive
 @pytest.mark.usefixtures("result")
 def test_names_beyond_ascii_are_escaped():
     Path("jet é.reg").write_text("image\ncircle(30,30,6) # text={knöt ★}\n")
@@ -194,6 +200,7 @@ def test_names_beyond_ascii_are_escaped():
     assert len(held()["REPLICAS"].data) == 11
 
 
+@pytest.mark.exhaustive
 def test_without_stars_and_regions_pixels_have_errors(words):
     words[words.index("--star") : words.index("--star") + 2] = []
     assert cli.main(words) == 0
@@ -211,6 +218,7 @@ def forget_the_run():
         del hdus["ESTIMATE"]
 
 
+@pytest.mark.exhaustive
 @pytest.mark.usefixtures("result")
 def test_no_run_is_made_again_where_the_file_has_what_it_found(monkeypatch, capsys):
     assert cli.main([*ERRORS, "10"]) == 0
@@ -229,6 +237,7 @@ def test_no_run_is_made_again_where_the_file_has_what_it_found(monkeypatch, caps
     same_errors(held(), expected)
 
 
+@pytest.mark.exhaustive
 @pytest.mark.usefixtures("result")
 def test_another_seed_is_refused_before_a_run_is_made_again(monkeypatch, capsys):
     assert cli.main([*ERRORS, "10", "--quiet"]) == 0
@@ -238,6 +247,7 @@ def test_another_seed_is_refused_before_a_run_is_made_again(monkeypatch, capsys)
     assert "has replicas with --seed 0" in one_complaint(capsys.readouterr())
 
 
+@pytest.mark.exhaustive
 @pytest.mark.usefixtures("result")
 def test_replicas_of_a_run_that_rounds_otherwise_are_continued():
     assert cli.main([*ERRORS, "10", "--quiet"]) == 0
@@ -247,6 +257,7 @@ def test_replicas_of_a_run_that_rounds_otherwise_are_continued():
     assert len(held()["REPLICAS"].data) == 11
 
 
+@pytest.mark.exhaustive
 @pytest.mark.usefixtures("result")
 @pytest.mark.parametrize("n", [0, 3])
 def test_a_table_of_other_than_one_row_holds_no_run(n, capsys):
@@ -265,6 +276,7 @@ def test_replicas_are_made_on_the_device_of_the_run(words, monkeypatch):
     assert Again.read("out.fits", quiet=True).outcome().setup.device == "0:7"
 
 
+@pytest.mark.exhaustive
 @pytest.mark.usefixtures("result")
 def test_a_run_that_was_interrupted_has_errors_but_is_not_made_again(capsys):
     fits.setval("out.fits", "STOPPED", value="interrupt")
@@ -277,6 +289,7 @@ def test_a_run_that_was_interrupted_has_errors_but_is_not_made_again(capsys):
     assert cli.main(["errors", "out.fits.gz"]) != 0
 
 
+@pytest.mark.exhaustive
 @pytest.mark.usefixtures("result")
 def test_overwrite_begins_anew():
     assert cli.main([*ERRORS, "10"]) == 0
@@ -289,6 +302,7 @@ def test_overwrite_begins_anew():
     )
 
 
+@pytest.mark.exhaustive
 @pytest.mark.usefixtures("result")
 def test_replicas_of_another_command_meanwhile_are_kept(monkeypatch, capsys):
     """Of the same replicas the more are kept, and those of something else are not replaced."""
@@ -328,6 +342,7 @@ WRONG_USES = [
 ]
 
 
+@pytest.mark.exhaustive
 @pytest.mark.usefixtures("result")
 def test_wrong_uses_are_one_line_and_leave_the_file(capsys):
     Path("empty.reg").write_text("")

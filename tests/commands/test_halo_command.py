@@ -29,6 +29,7 @@ def command(tmp_path, monkeypatch):
     return [*words, "--engine", "numpy", "-o", "out.fits"]
 
 
+@pytest.mark.exhaustive
 def test_amounts_are_printed_and_in_the_file(command, capsys):
     assert cli.main([*command, "--halo", "halos.fits"]) == 0
     captured = capsys.readouterr()
@@ -54,6 +55,7 @@ def test_amounts_are_printed_and_in_the_file(command, capsys):
     )
 
 
+@pytest.mark.exhaustive
 def test_several_halos_one_for_all_images_and_a_level(command, capsys):
     assert cli.main([*command, "--halo", "mean.fits", "--halo", "flat", "--quiet"]) == 0
     table = fits.getdata("out.fits", "HALOS")
@@ -68,6 +70,7 @@ def read_result_names(path):
         return [each.name for each in hdus]
 
 
+@pytest.mark.exhaustive
 def test_errors_of_halos_by_replicas(command, capsys):
     assert cli.main([*command, "--halo", "halos.fits", "--quiet"]) == 0
     assert cli.main(["errors", "out.fits", "--bootstrap", "10", "--quiet"]) == 0
@@ -94,6 +97,7 @@ def test_wrong_uses_are_one_clear_line(command, words, capsys):
     assert WRONG[words] in errors[0]
 
 
+@pytest.mark.exhaustive
 def test_no_halo_leaves_no_table(command):
     assert cli.main([*command, "--quiet"]) == 0
     assert "HALOS" not in read_result_names("out.fits")

@@ -129,6 +129,7 @@ def write_stpsf():
     fits.HDUList(hdus).writeto("stpsf.fits")
 
 
+@pytest.mark.exhaustive
 @pytest.mark.parametrize(
     ("make", "kind"),
     [
@@ -169,6 +170,7 @@ def test_photometry_and_noise(command_folder, capsys, make, kind):
         assert f" {option} " in command
 
 
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("kind", ["photutils", "SExtractor", "Gaia"])
 def test_tables_of_stars(command_folder, capsys, kind):
     seconds, _ = of_wfc3_ir("ir")
@@ -243,6 +245,7 @@ class TestWhatIsGiven:
         write_plainly("sbc.fits", {"TELESCOP": "HST", "DETECTOR": "SBC"}, cards)
         assert calibrate("sbc.fits", {}).keys() == {"read_noise", "background"}
 
+    @pytest.mark.exhaustive
     def test_nicmos_needs_no_option(self, capsys):
         """Its converter's gain is ADCGAIN; ERR may lack the noise of the source."""
         seconds, gain = 703.9, 5.4

@@ -144,6 +144,7 @@ def test_a_damaged_oversamp_is_one_line(result, tmp_path, value, capsys):
     assert f"OVERSAMP is {value:g}" in line
 
 
+@pytest.mark.exhaustive
 @pytest.mark.usefixtures("quick_figures")
 def test_the_file_is_drawn_on_the_images_pixels(result, tmp_path):
     view = view_of(read_result(result))
@@ -153,6 +154,7 @@ def test_the_file_is_drawn_on_the_images_pixels(result, tmp_path):
     assert "its light in each pixel of the images" in (tmp_path / "page.html").read_text("utf-8")
 
 
+@pytest.mark.exhaustive
 def test_regions_are_measured_on_the_finer_sky(result, tmp_path, capsys):
     """In pixels of the extended source, and on the sky: one circle, 3 pixels of the images."""
     there = WCS(fits.getheader(result)).pixel_to_world(16 * Q + 0.5, 7 * Q + 0.5)

@@ -46,6 +46,7 @@ def run(*options, output="out.fits"):
         return cli.main([*WORDS, *options, "-o", output])
 
 
+@pytest.mark.exhaustive
 def test_the_file_has_the_psfs_and_their_parameters(capsys):
     assert run("--refine-psfs", "shift", "jitter") == 0
     assert (
@@ -77,12 +78,14 @@ def test_the_file_has_the_psfs_and_their_parameters(capsys):
     np.testing.assert_array_equal(fits.getdata("out.fits"), result.extended)
 
 
+@pytest.mark.exhaustive
 def test_what_does_not_fit_is_refined_where_that_is_asked(capsys):
     assert run("--refine-psfs", "jitter") == 0
     assert "lnocl: PSFs refined, jitter fitted: their misfit is " in capsys.readouterr().err
     assert fits.getheader("out.fits")["PSFUSED"] is True
 
 
+@pytest.mark.exhaustive
 def test_none_are_refined_where_that_is_asked(capsys):
     assert run("--refine-psfs", "none", "--no-refine") == 0
     assert "lnocl: the misfit of the PSFs is " in capsys.readouterr().err
@@ -97,6 +100,7 @@ def test_with_a_smoothing_that_is_given_the_file_has_neither():
         assert "PSFUSED" not in hdus[0].header
 
 
+@pytest.mark.exhaustive
 def test_files_of_ideal_psfs_and_modes():
     files = ["--psf-errors", "ideal=ideal.fits", "modes=modes.fits"]
     assert run("--refine-psfs", "strehl", "modes", *files) == 0
@@ -107,6 +111,7 @@ def test_files_of_ideal_psfs_and_modes():
         assert header[keyword] == hashlib.sha256(Path(path).read_bytes()).hexdigest()
 
 
+@pytest.mark.exhaustive
 def test_files_of_pupils_and_scatter():
     fits.writeto("pupil.fits", (np.hypot(X - 16, Y - 16) < 6.0).astype(float))
     fits.writeto("scatter.fits", 0.02 * PSF)
@@ -123,6 +128,7 @@ def test_files_of_pupils_and_scatter():
         assert hdus["DOUBTFUL"].data[STAR[::-1]] == 1
 
 
+@pytest.mark.exhaustive
 def test_doubtful_pixels_are_outlined_and_said(capsys):
     fits.writeto("scatter.fits", 0.05 * PSF)
     assert run("--psf-errors", "scatter=scatter.fits") == 0
@@ -162,6 +168,7 @@ def test_what_is_refused(options, message, capsys):
     assert message in capsys.readouterr().err
 
 
+@pytest.mark.exhaustive
 def test_an_error_that_is_left_is_said_in_the_verdict(capsys):
     sky = SKY.copy()
     sky[STAR[::-1]] = 3e6

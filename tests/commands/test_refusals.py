@@ -123,6 +123,7 @@ class TestRefusals:
         assert run("--device", "5:7", image="no.fits", engine=()) == error.exit_status
         assert one_complaint(capsys.readouterr()) == str(error)
 
+    @pytest.mark.exhaustive
     @pytest.mark.parametrize("command", [["devices"], ["deconvolve"]])
     def test_no_platform(self, command):
         arguments = ["a.fits", "--psf", "k1.fits", "-o", "out.fits"]

@@ -5,6 +5,7 @@ import pytest
 from astropy.io import fits
 from astropy.wcs import WCS
 from matplotlib.figure import Figure
+from scenes import named
 from turned_scenes import gaussian
 
 import lnocl
@@ -47,8 +48,14 @@ def frames(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize(
     "places",
-    [("--align", "wcs"), ("--angle", "PARANG"), ("--angle", "PARANG", "--centre", "24,24")],
-    ids=["wcs", "angle", "centre"],
+    named(
+        {
+            "wcs": ("--align", "wcs"),
+            "angle": ("--angle", "PARANG"),
+            "centre": ("--angle", "PARANG", "--centre", "24,24"),
+        },
+        "wcs",
+    ),
 )
 def test_rolls(frames, places, capsys):
     command = ["deconvolve", *frames, "--psf", "psf.fits", "--background", "10", "--n-iter", "40"]
@@ -84,6 +91,7 @@ def test_a_centre_is_in_pixels(frames, capsys):
     assert "'4h20m,19d' is not X,Y in pixels" in capsys.readouterr().err
 
 
+@pytest.mark.exhaustive
 def test_epochs(frames, capsys):
     """Three nights, the star's flux in each in the table, and one line and one circle for it."""
     command = ["deconvolve", *frames, "--psf", "psf.fits", "--background", "10", "--n-iter", "40"]
@@ -99,6 +107,7 @@ def test_epochs(frames, capsys):
     assert len(view_of(read_result("out.fits")).stars) == 1
 
 
+@pytest.mark.exhaustive
 def test_epochs_by_a_keyword(frames, capsys):
     for path, night in zip(frames, ("2026-01-01", "2026-01-02", "2026-01-01"), strict=True):
         fits.setval(path, "DATE-OBS", value=night)

@@ -56,6 +56,7 @@ def frames(tmp_path, monkeypatch):
     return ["coarse.fits", "sharp.fits"]
 
 
+@pytest.mark.exhaustive
 def test_images_of_two_scales(frames, capsys):
     command = ["deconvolve", *frames, "--psf", "coarse_psf.fits", "sharp_psf.fits"]
     command += ["--mask", "coarse_bad.fits", "sharp_bad.fits", "--background", "auto"]

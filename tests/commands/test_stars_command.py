@@ -29,6 +29,7 @@ def folder(tmp_path, monkeypatch):
     return tmp_path
 
 
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("output", ["stars.ecsv", "stars.csv", "stars.fits"])
 def test_the_table_is_taken_by_deconvolve(output, capsys):
     assert cli.main(["stars", "image.fits", "--psf", "psf.fits", "-o", output]) == 0
@@ -46,6 +47,7 @@ def test_the_table_is_taken_by_deconvolve(output, capsys):
     np.testing.assert_allclose(found["flux"], [3e4, 8e3], rtol=0.1)
 
 
+@pytest.mark.exhaustive
 def test_the_picture_has_the_stars_and_their_numbers(capsys):
     pytest.importorskip("matplotlib")
     from lnocl.plotting.stars import draw_stars
@@ -85,6 +87,7 @@ def test_cosmic_rays_and_flat_tops_are_told(capsys):
     assert len(Table.read("stars.ecsv")) == 2
 
 
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("word", ["given", "default"])
 def test_flags_and_weights_of_the_file_are_heeded(word, capsys):
     counts = fits.getdata("image.fits")

@@ -52,6 +52,7 @@ def test_stars_are_found_among_cosmic_rays_and_nothing_else(width, is_given):
     assert len(RAYS) <= stars.meta["n_sharp"] <= len(RAYS) + 3
 
 
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("width", [1.6, 2.2, 5.0])
 @pytest.mark.parametrize("factor", [1.0, 1.5])
 def test_stars_are_not_taken_for_cosmic_rays(width, factor):
@@ -106,6 +107,7 @@ class TestFlatTops:
         assert (flat == np.isin(counts, [7e4, 9e4])).all()
 
 
+@pytest.mark.exhaustive
 def test_the_threshold_is_of_the_significance_in_the_table():
     """Four bright stars near each other make the noise seem large as long as they are in it."""
     psf = lopsided(30, 30, 4.0, (61, 61))

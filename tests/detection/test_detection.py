@@ -51,6 +51,7 @@ def test_all_are_found_the_brightest_first(psf, seed):
         assert stars["significance"][0] == pytest.approx(0.84 * 2000 / 5 * sharpness, rel=0.06)
 
 
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("scale", [2.0**-20, 2.0**20])
 def test_units_do_not_matter(scale):
     one, other = find_stars(make_image()), find_stars(scale * make_image())
@@ -125,6 +126,7 @@ class TestOtherProfiles:
         assert found.meta["n_extended"] == 1
         np.testing.assert_allclose(found["width"][:4], 2.355 * 1.5, rtol=0.05)
 
+    @pytest.mark.exhaustive
     def test_without_a_psf_the_narrow_sources_are_the_stars(self):
         image = make_image()
         for k in range(8):
@@ -158,6 +160,7 @@ class TestOtherProfiles:
         assert len(find_stars(image)) == 1
 
 
+@pytest.mark.exhaustive
 @pytest.mark.filterwarnings("ignore::lnocl.errors.LnoclWarning")
 @pytest.mark.parametrize("seed", range(3))
 def test_between_holes_there_are_next_to_no_stars(seed):
@@ -170,6 +173,7 @@ def test_between_holes_there_are_next_to_no_stars(seed):
         assert len(find_stars(200 - image, psf)) <= 1
 
 
+@pytest.mark.exhaustive
 def test_a_star_that_a_fit_moves_away_is_not_found_again(monkeypatch):
     """In a field of galaxies the same star was found without end."""
     scenes = Path(__file__).parents[2] / "benchmarks" / "stars.py"
@@ -219,6 +223,7 @@ class TestSaturated:
         assert np.hypot(stars["x"][0] - 30.3, stars["y"][0] - 25.8) < 1.0
         assert stars["saturated"].tolist() == [True, False, False, False]
 
+    @pytest.mark.exhaustive
     def test_a_large_core_is_one_star(self):
         image = make_image() + 3e6 * gaussian(60, 60, 4.0)
         stars = find_stars(image.clip(max=3000.0), PSF, saturation=3000.0)
@@ -236,6 +241,7 @@ class TestSaturated:
         assert np.hypot(stars["x"] - 30.3, stars["y"] - 25.8).min() < 0.7
         assert stars["saturated"].sum() <= 1
 
+    @pytest.mark.exhaustive
     def test_bad_pixels_in_the_sky_are_no_stars(self):
         image = make_image()
         image[50:54, 60:63] = image[80, :] = np.nan
@@ -268,6 +274,7 @@ def test_refusals(image, given, message):
         find_stars(image, **given)
 
 
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("share", [0.35, 0.51, 0.7])
 @pytest.mark.parametrize("outside", [0.0, np.nan])
 def test_what_is_outside_the_field_has_no_stars(share, outside):
@@ -280,6 +287,7 @@ def test_what_is_outside_the_field_has_no_stars(share, outside):
         assert np.hypot(found["x"] - place[0], found["y"] - place[1]).min() < 0.3
 
 
+@pytest.mark.exhaustive
 def test_pixels_without_counts_are_data():
     counts = np.random.default_rng(3).poisson(0.03 + 40 * gaussian(50, 50)).astype(float)
     assert np.hypot(find_stars(counts, PSF)["x"][0] - 50, 0) < 0.3

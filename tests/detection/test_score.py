@@ -339,6 +339,7 @@ def test_values_of_turned_images_scatter_as_noise_does(degrees, scale):
     assert np.mean(fluxes) == pytest.approx(900.0, rel=0.06)
 
 
+@pytest.mark.exhaustive
 def test_values_scatter_as_noise_does():
     """The variance of 40 fields, near stars and away from them; their mean is 0."""
     values = []
@@ -421,6 +422,7 @@ def test_rare_counts_are_as_rare_as_those_of_poisson(level):
     assert (found < high + 0.01).all()
 
 
+@pytest.mark.exhaustive
 def test_rare_sums_of_counts_are_as_rare_as_simulated():
     """A profile like that of a PSF, whose sums are no whole numbers."""
     profile = PSFS[0].ravel()

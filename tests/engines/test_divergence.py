@@ -46,6 +46,7 @@ def exact(ratio):
 
 # Relative errors, twice what was measured on PoCL and Intel's runtime: 6.0e-7 and 1.2e-15 where
 # terms of 2^e cancel, 1.7e-7 and 3.4e-16 between sqrt(1/2) and sqrt(2), where there are none.
+@pytest.mark.exhaustive
 @pytest.mark.parametrize(
     ("dtype", "tolerance", "tolerance_near_1"),
     [

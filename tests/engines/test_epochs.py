@@ -66,6 +66,7 @@ def without_first_star(**changes):
     return observation(epochs=EPOCHS, mask=bad, **changes)
 
 
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("engine", FEWER_ENGINES)
 def test_a_star_that_one_epoch_does_not_show_has_no_flux_there_and_the_others_as_before(engine):
     given, shown = without_first_star(), np.array([False, True, True, True])
@@ -104,6 +105,7 @@ def bad_first_star():
     return bad
 
 
+@pytest.mark.exhaustive
 @pytest.mark.filterwarnings("ignore:the star at .* is on no good pixel of epoch 2")
 def test_a_flux_that_no_image_shows_is_nan_wherever_fluxes_are_told(tmp_path):
     given, seen, lost = nights(bad_first_star()), [], [False, False, True, False, False, False]
@@ -132,6 +134,7 @@ def test_a_flux_that_no_image_shows_is_nan_wherever_fluxes_are_told(tmp_path):
     np.testing.assert_array_equal(saved.star_fluxes, result.star_fluxes)
 
 
+@pytest.mark.exhaustive
 @pytest.mark.filterwarnings("ignore:the star at .* is on no good pixel of epoch 2")
 def test_what_is_made_of_light_curves_leaves_out_fluxes_that_no_image_shows():
     result = paper(nights(bad_first_star()), PLACES, n_iter=8, engine="numpy")
@@ -160,6 +163,7 @@ def test_a_star_that_images_of_an_epoch_do_not_reach_has_no_flux_there():
     assert np.isnan(result.star_fluxes[1])
 
 
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("moves", [False, True])
 def test_a_star_that_is_masked_everywhere_is_left_out_and_rows_stay(moves):
     bad = scenes_turned.mask()
@@ -193,6 +197,7 @@ def test_engines_agree(precision, allowed):
     assert worst(found.star_fluxes, expected.star_fluxes) <= allowed
 
 
+@pytest.mark.exhaustive
 def test_one_epoch_is_none():
     one, none = (
         paper(given, STARS, n_iter=8, engine="numpy")
@@ -202,6 +207,7 @@ def test_one_epoch_is_none():
     assert "epoch" not in one.to_table().colnames
 
 
+@pytest.mark.exhaustive
 def test_a_star_is_in_the_images_of_its_epoch_alone():
     scene = Scene(observation(epochs=EPOCHS), STARS)
     np.testing.assert_array_equal(scene.shown, [[False, True, False], [True, False, True]] * 2)
@@ -214,6 +220,7 @@ def test_a_star_is_in_the_images_of_its_epoch_alone():
     np.testing.assert_allclose(total, plain.star_weights, rtol=1e-14)
 
 
+@pytest.mark.exhaustive
 def test_what_is_expected_under_a_star_does_not_hang_on_the_number_of_epochs():
     """Else the edge of its core would be filled once for each."""
     found = []
@@ -237,6 +244,7 @@ def test_exposures_of_epochs_weigh_their_stars():
     assert worst(result.star_fluxes, 900.0) <= 0.02
 
 
+@pytest.mark.exhaustive
 def test_held_out_counts_of_epochs_resume(tmp_path):
     options = {"n_iter": 12, "engine": "numpy", "checkpoint": str(tmp_path / "run.fits")}
     given = observation(epochs=EPOCHS)
@@ -246,6 +254,7 @@ def test_held_out_counts_of_epochs_resume(tmp_path):
     same(found, whole)
 
 
+@pytest.mark.exhaustive
 @pytest.mark.filterwarnings("ignore::lnocl.LnoclWarning")
 def test_fluxes_of_nights_and_their_errors():
     """A star of six nights beside a second one on a common host: pulls of 8 seeds."""
@@ -276,6 +285,7 @@ def test_fluxes_of_nights_and_their_errors():
     assert table["x"].value.tolist() == np.repeat(stars[:, 0], 6).tolist()
 
 
+@pytest.mark.exhaustive
 @pytest.mark.filterwarnings("ignore::lnocl.LnoclWarning")
 def test_replicas_name_star_and_epoch():
     given = observation(epochs=EPOCHS)
@@ -284,6 +294,7 @@ def test_replicas_name_star_and_epoch():
     assert names == [f"star {s} epoch {e} flux" for s in (1, 2) for e in (0, 1)]
 
 
+@pytest.mark.exhaustive
 def test_what_is_refused():
     with pytest.raises(lnocl.LnoclError, match=r"epochs`? has shape"):
         observation(epochs=[1, 2])

@@ -95,6 +95,7 @@ def test_iterations_are_those_of_the_matrix(engine, q):
     assert np.all(errors <= np.array(TOLERANCES[engine["precision"]])), errors
 
 
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("engine", FEWER_ENGINES)
 def test_steps_lower_the_objective_to_one_minimum(engine):
     """Both methods end where the gradient in every pixel of the sky is 0 or holds it at 0."""
@@ -113,6 +114,7 @@ def test_steps_lower_the_objective_to_one_minimum(engine):
     assert gradient.min() > -0.006
 
 
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("engine", FEWER_ENGINES)
 def test_a_run_resumes_bit_for_bit(engine, tmp_path):
     made, path = MADE[2], tmp_path / "run.fits"
@@ -125,6 +127,7 @@ def test_a_run_resumes_bit_for_bit(engine, tmp_path):
         made.deconvolve(other, **given, resume=path)
 
 
+@pytest.mark.exhaustive
 def test_held_out_counts_choose_and_errors_are_there():
     made = MADE[2]
     given = {"engine": "numpy", "n_iter": 60, "pad": 0}

@@ -85,6 +85,7 @@ def test_counts_of_the_shape_are_all_in_the_halo(solver, engine):
     assert result.extended.sum() <= 200.0
 
 
+@pytest.mark.exhaustive
 def test_amounts_are_unbiased_with_errors_of_the_right_size():
     pulls, star_pulls = [], []
     for seed in range(6):
@@ -97,6 +98,7 @@ def test_amounts_are_unbiased_with_errors_of_the_right_size():
     assert abs(np.mean(star_pulls)) <= 1.2
 
 
+@pytest.mark.exhaustive
 def test_a_flat_halo_is_a_level_of_the_background():
     pulls = []
     for seed in range(4):
@@ -111,6 +113,7 @@ def test_a_flat_halo_is_a_level_of_the_background():
     assert np.sqrt(np.mean(np.square(pulls))) <= 1.7
 
 
+@pytest.mark.exhaustive
 def test_without_halos_nothing_changes():
     light = halo_scenes.means(halo_scenes.speckles(), AMOUNTS)
     given = observation(light=light, halos=np.ones((0, P, N, N)))
@@ -120,6 +123,7 @@ def test_without_halos_nothing_changes():
     assert results[0].halo_fluxes.shape == results[0].halo_flux_errors.shape == (0, P)
 
 
+@pytest.mark.exhaustive
 def test_order_and_scale():
     given = observation()
     first = lnocl.deconvolve(given, [STAR], stop=None, n_iter=12, engine="numpy")
@@ -152,6 +156,7 @@ def test_exposures_leave_amounts_as_they_are():
         np.testing.assert_allclose(found.models(), plain.models(), rtol=1e-8)
 
 
+@pytest.mark.exhaustive
 def test_unequal_exposures_and_a_map_agree():
     given, exposure = observation(), np.array([1.0, 2.0, 0.5])
     images = halo_scenes.means(given.halos[0], AMOUNTS, 20.0) - 20.0
@@ -173,6 +178,7 @@ def test_unequal_exposures_and_a_map_agree():
         assert worst(each.star_fluxes, FLUX) <= 0.05
 
 
+@pytest.mark.exhaustive
 def test_two_halos_and_a_quarter_turn():
     """Images that are turned by index carry their halos; padding leaves them where they are."""
     flat, halos = np.ones((P, N, N)), halo_scenes.speckles()
@@ -196,6 +202,7 @@ def test_two_halos_and_a_quarter_turn():
     np.testing.assert_allclose(results[0].halo_fluxes, results[1].halo_fluxes, rtol=1e-4)
 
 
+@pytest.mark.exhaustive
 def test_epochs_and_masks():
     bad = np.random.default_rng(3).random((P, N, N)) < 0.05
     given = observation(mask=bad, epochs=[0, 1, 0])
@@ -212,6 +219,7 @@ def test_epochs_and_masks():
     assert len(result.star_fluxes) == len(result.to_table()) == 2
 
 
+@pytest.mark.exhaustive
 def test_positions_are_refined_beside_halos_that_stay():
     places = [(STAR[0] + 0.4, STAR[1] - 0.3)]
     options = {"stop": None, "n_iter": 15, "engine": "numpy"}
@@ -236,6 +244,7 @@ def test_an_observation_carries_halos():
         assert observation(halos=np.ones(shape)).halos.shape == (1, P, N, N)
 
 
+@pytest.mark.exhaustive
 def test_replicas_scatter_as_the_errors_say():
     result = lnocl.deconvolve(observation(), [STAR], stop=None, n_iter=10, engine="numpy")
     found = result.bootstrap(10, seed=0)
@@ -289,6 +298,7 @@ def test_values_that_are_bad_where_pixels_are_do_no_harm():
         observation(halos=np.ma.array(np.ones((N, N)), mask=bad))
 
 
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("stop", [None, "held-out"])
 def test_a_run_resumes_bit_for_bit(tmp_path, stop):
     given, path = observation(), str(tmp_path / "run.fits")
@@ -307,6 +317,7 @@ def test_a_run_resumes_bit_for_bit(tmp_path, stop):
         lnocl.deconvolve(other, [STAR], resume=path, **options)
 
 
+@pytest.mark.exhaustive
 def test_amounts_beside_a_finer_sky():
     """Pixels of the sky share the noise of an image's, of which light is told from nothing."""
     v, u = np.indices((39, 39)) - 19

@@ -263,6 +263,7 @@ def test_the_tuning_of_a_gpu_gives_the_same(monkeypatch, precision, recipe):
     assert worst(result.star_fluxes, star_fluxes) <= star_tolerance
 
 
+@pytest.mark.exhaustive
 @pytest.mark.parametrize(
     "tuning", [None, pytest.param(program.Tuning(1, 8, group=4), marks=pytest.mark.exhaustive)]
 )

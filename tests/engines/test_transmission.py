@@ -66,6 +66,7 @@ def test_iterations_are_those_of_the_matrix(engine):
     assert worst(result.star_fluxes, fluxes) <= 2e-5
 
 
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("engine", FEWER_ENGINES)
 def test_steps_of_both_engines_agree(engine):
     given = observation(transmission=shares())
@@ -76,6 +77,7 @@ def test_steps_of_both_engines_agree(engine):
     assert worst(found.star_fluxes, expected.star_fluxes) <= 2e-6
 
 
+@pytest.mark.exhaustive
 def test_all_of_the_light_changes_nothing():
     ones = observation(transmission=np.ones((NY, NX)))
     found, expected = (
@@ -119,6 +121,7 @@ def test_a_sky_that_good_pixels_do_not_show_is_refused():
         given.replace(mask=shares > 0)
 
 
+@pytest.mark.exhaustive
 def test_a_window_has_its_part_of_the_transmission():
     given = observation(transforms=None, transmission=shares())
     cut = given.window(range(3, 19), range(5, 30))
@@ -138,6 +141,7 @@ def test_beyond_each_edge_a_transmission_is_that_of_the_edge():
     np.testing.assert_array_equal(found[:, 32:36], 31 / 32)
 
 
+@pytest.mark.exhaustive
 def test_one_map_serves_all_images_and_takes_no_more_memory():
     given = observation(transmission=np.full((NY, NX), 0.5))
     scene = Scene(given, STARS)

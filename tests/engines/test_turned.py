@@ -9,7 +9,7 @@ import functools
 import numpy as np
 import pytest
 import turned_scenes as scenes_turned
-from scenes import FEWER_ENGINES, NUMPY_FIRST, make_psfs, paper, same, worst
+from scenes import FEWER_ENGINES, NUMPY_FIRST, make_psfs, named, paper, same, worst
 from scipy.ndimage import gaussian_filter
 from turned_scenes import ANGLES, FLUXES, GRID, NX, NY, STARS, observation, psfs
 
@@ -45,6 +45,7 @@ def scene(maps):
     return Scene(observation(maps), STARS)
 
 
+@pytest.mark.exhaustive
 def test_the_grid_holds_all_that_is_turned(scene, maps):
     assert scene.grid == GRID
     assert scene.observation.sky_shape == (NY, NX)
@@ -52,6 +53,7 @@ def test_the_grid_holds_all_that_is_turned(scene, maps):
     assert scales == pytest.approx([1.0, 1.0, 1.0 if maps is None else 1.7])
 
 
+@pytest.mark.exhaustive
 def test_model_is_that_of_the_matrix(scene, maps):
     """The shears and the PSF's edges leave 2e-4 of the brightest pixel."""
     extended = scenes_turned.sky()
@@ -127,6 +129,7 @@ def test_iterations_are_those_of_the_matrix(engine, maps):
     assert worst(result.star_fluxes, fluxes) <= 4e-4  # measured 1.4e-4
 
 
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("engine", FEWER_ENGINES)
 def test_iterations_of_a_finer_sky_are_those_of_the_matrix(engine, maps):
     """Images have every second pixel of those before, along each axis."""
@@ -155,7 +158,7 @@ def reference(solver, name):
         pytest.param("sgp", "double", 1e-12, marks=pytest.mark.exhaustive),
     ],
 )
-@pytest.mark.parametrize("name", MAPS)
+@pytest.mark.parametrize("name", named({name: name for name in MAPS}, "turned"))
 def test_engines_agree(name, solver, precision, allowed):
     given = observation(MAPS[name])
     found = paper(given, STARS, solver=solver, n_iter=30, **START, precision=precision)
@@ -185,6 +188,7 @@ def test_images_that_are_launched_together(maps):
     assert worst(found[1].objectives(), found[0].objectives()) <= 3e-6
 
 
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("engine", FEWER_ENGINES)
 def test_engines_agree_where_stars_move(engine, maps):
     moved = {"refine_positions": True, "solver": "sgp", "stop": None, "n_iter": 40, "pad": 0}
@@ -235,6 +239,7 @@ def test_quarter_turns_are_those_by_index(engine, is_flipped):
     np.testing.assert_array_equal(found.psfs, turned(still.psfs))
 
 
+@pytest.mark.exhaustive
 def test_images_of_any_order():
     order = [2, 0, 1]
     given = observation()
@@ -273,6 +278,7 @@ def test_turns_beyond_45_degrees():
     assert abs(result.residuals()).max() <= 0.2  # in the images' own orientation
 
 
+@pytest.mark.exhaustive
 def test_derivatives_of_stars_are_along_the_skys_axes():
     scene = Scene(observation(), STARS, max_shift=MAX_SHIFT)
     model = Model(scene)
@@ -420,6 +426,7 @@ def test_lists_go_wrong_in_one_line():
         assert caught.value.message.startswith(message)
 
 
+@pytest.mark.exhaustive
 @pytest.mark.parametrize(("degrees", "scale"), [(0.0, 5.6), (20.0, 4.0)])
 def test_stars_in_larger_pixels_are_marginal(degrees, scale):
     """Where sky and fluxes are right, the step of stars leaves them, but for the texture's pull."""
@@ -459,6 +466,7 @@ def test_images_of_few_pixels(engine, shape):
     assert worst(result.models(), 9.0) <= 0.02
 
 
+@pytest.mark.exhaustive
 def test_a_run_that_was_cut_off_goes_on(tmp_path):
     file = tmp_path / "run.ckpt"
 
@@ -471,6 +479,7 @@ def test_a_run_that_was_cut_off_goes_on(tmp_path):
     same(paper(*given, n_iter=12, resume=file), whole)
 
 
+@pytest.mark.exhaustive
 def test_all_goes_wrong_in_one_line():
     maps = scenes_turned.transforms()
     sheared = maps.copy()
@@ -492,6 +501,7 @@ def test_all_goes_wrong_in_one_line():
         lnocl.rotations(3.0, (0, 0))
 
 
+@pytest.mark.exhaustive
 @pytest.mark.filterwarnings("ignore::lnocl.LnoclWarning")
 def test_defaults_and_errors(caplog):
     """Held-out counts, smoothing and errors take images that are turned."""
@@ -504,6 +514,7 @@ def test_defaults_and_errors(caplog):
     assert np.isfinite(errors["error"]).all()
 
 
+@pytest.mark.exhaustive
 def test_images_of_several_shapes():
     """A list of arrays is what those with bad pixels at their ends are; PSFs keep their centre."""
     maps, whole = scenes_turned.scaled(), observation(scenes_turned.scaled())
@@ -527,6 +538,7 @@ def test_images_of_several_shapes():
     assert worst(one.extended, other.extended) <= 0.02  # the edges of the PSF that were cut
 
 
+@pytest.mark.exhaustive
 def test_a_flat_sky_is_as_bright_as_pixels_are_large():
     """The start is flat, and of the light of all images, whatever their pixels are."""
     maps = scenes_turned.scaled()
@@ -550,6 +562,7 @@ def fields():
 QUARTERS = ANGLES + np.array([90.0, 180.0, -90.0])
 
 
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("angles", [ANGLES, QUARTERS], ids=["turned", "quarter turns"])
 def test_stars_have_the_psf_of_their_place_in_each_image(angles):
     maps = scenes_turned.transforms(angles)
@@ -572,6 +585,7 @@ def test_stars_have_the_psf_of_their_place_in_each_image(angles):
             assert worst(found[j], expected) <= 3e-4, (j, s)
 
 
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("angles", [ANGLES, QUARTERS], ids=["turned", "quarter turns"])
 def test_the_sky_has_the_psfs_of_the_middle_of_each_image(angles):
     maps = scenes_turned.transforms(angles)
@@ -584,6 +598,7 @@ def test_the_sky_has_the_psfs_of_the_middle_of_each_image(angles):
             np.testing.assert_allclose(scene.psf(j), expected, atol=1e-11)
 
 
+@pytest.mark.exhaustive
 def test_one_field_is_not_for_pixels_of_several_sizes():
     with pytest.raises(lnocl.LnoclError, match="one PSF is given for images whose pixels are 1"):
         observation(scenes_turned.scaled(), psfs=fields()[0])

@@ -31,6 +31,7 @@ def spoil(path, old, new):
 
 
 class TestTiles:
+    @pytest.mark.exhaustive
     @pytest.mark.parametrize(
         ("kind", "tile"), [("RICE_1", (1, 34)), ("GZIP_2", (10, 9)), ("HCOMPRESS_1", (7, 17))]
     )
@@ -41,6 +42,7 @@ class TestTiles:
         np.testing.assert_array_equal(stack.data, COUNTS[np.newaxis])
         assert fitsread.read_keyword(path, stack.header, "EXPTIME") == 30.0
 
+    @pytest.mark.exhaustive
     def test_of_several_extensions_it_is_the_science_array(self, tmp_path):
         """As DECam, LCO and ZTF pack them; floats are rounded to a share of their noise."""
         image = np.random.default_rng(6).normal(5.0, 1.0, COUNTS.shape).astype("f4")

@@ -142,6 +142,7 @@ sys.stdin.read()
 """
 
 
+@pytest.mark.exhaustive
 def test_processes_claim_devices_that_the_fewest_others_have(tmp_path, monkeypatch):
     monkeypatch.setenv("TMPDIR", str(tmp_path))
     started = []
@@ -181,6 +182,7 @@ def test_no_platform(monkeypatch):
         device.choose()
 
 
+@pytest.mark.exhaustive
 def test_no_double_precision(monkeypatch):
     monkeypatch.setattr(program, "has_double", lambda device: False)
     observation = lnocl.Observation(np.ones((16, 32)), np.ones((1, 1)))
@@ -225,6 +227,7 @@ def test_memory_estimate_is_what_the_buffers_hold(shape, tuning, caplog):
     assert message.startswith(start)
 
 
+@pytest.mark.exhaustive
 def test_plain_arrays_need_no_astropy_and_the_reference_engine_no_opencl():
     code = (
         "import sys; sys.modules['pyopencl'] = None\n"

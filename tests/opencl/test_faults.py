@@ -82,6 +82,7 @@ def describe():
     return device.describe(device.choose().device)
 
 
+@pytest.mark.exhaustive
 @pytest.mark.parametrize(
     ("kind", "code"),
     [

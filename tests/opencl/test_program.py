@@ -57,6 +57,7 @@ def test_the_programs_used_last_are_held(context, compiled):
     assert len(compiled) == len(sizes) + 1
 
 
+@pytest.mark.exhaustive
 def test_the_names_of_arguments_are_those_that_the_kernels_declare(context):
     arguments = Program(context, (128, 64), np.dtype(np.float32)).arguments
     assert arguments["rfft_rows"] == ("spectra", "pixels", "row_roots", "scratch")

@@ -80,6 +80,7 @@ def test_an_image_that_does_not_see_a_star_has_no_picture_of_it():
     assert images[1] == []
 
 
+@pytest.mark.exhaustive
 @pytest.mark.parametrize(("p", "side"), [(1, 1400), (4, 800), (20, 300)])
 def test_it_is_small_whatever_the_images(p, side):
     page = make_report(make_view(p=p, n_stars=7, shape=(side, side)), "a")

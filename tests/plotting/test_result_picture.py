@@ -59,6 +59,7 @@ def test_what_is_shown_of_each():
     assert zoom[0][1].get_extent() == [-0.5, 26.5, 3.5, 36.5]
 
 
+@pytest.mark.exhaustive
 def test_the_image_of_the_largest_residuals_is_shown():
     view = make_view(p=3)
     view.residuals[1, 50:, 60:] = 40.0  # far from the star
@@ -92,6 +93,7 @@ def test_bad_pixels_are_grey_and_change_no_stretch():
     assert image_limits(np.full((3, 3), np.nan)) == (0.0, 1.0, 1.0)
 
 
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("scale", [0.0, 1e-320, 1e-20, 1e200])
 def test_any_unit_is_drawn(scale, tmp_path):
     view = make_view(p=1)
@@ -104,6 +106,7 @@ def test_a_unit_is_no_formula():
     draw_result(dataclasses.replace(make_view(p=0), unit=r"$\bad{$")).draw_without_rendering()
 
 
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("value", [0.0, 5.0])
 def test_a_flat_image_and_an_empty_source_are_drawn(value, tmp_path):
     flat = np.full((1, 60, 70), value)
@@ -111,6 +114,7 @@ def test_a_flat_image_and_an_empty_source_are_drawn(value, tmp_path):
     draw_result(view).savefig(tmp_path / "flat.png")
 
 
+@pytest.mark.exhaustive
 def test_of_many_stars_the_brightest_are_enlarged():
     view = make_view(p=1, n_stars=9)
     view.star_fluxes[8] = 100.0
@@ -136,6 +140,7 @@ def test_light_curves_are_below():
     assert light_curves(np.ones(2), np.ones(2), np.zeros(2, int), "") is None
 
 
+@pytest.mark.exhaustive
 def test_stars_are_circled_in_image_and_source():
     figure = draw_result(make_view(p=1, offsets=np.array([[2.0, 0.0]])))
     whole = figure.subfigs[0].axes[:4]
@@ -160,6 +165,7 @@ def test_an_outline_leaves_the_enlarged_part_as_it_is(shape):
         assert image.axes.get_ylim() == (bottom, top)
 
 
+@pytest.mark.exhaustive
 def test_the_choice_is_that_of_held_out_counts_or_the_objective():
     def curve(view):
         (axis,) = draw_result(view).subfigs[1].axes
@@ -176,6 +182,7 @@ def test_the_choice_is_that_of_held_out_counts_or_the_objective():
     assert found["3"].tolist() == [40.0]
 
 
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("objectives", [[7.0], [7.0, np.nan], [7.0, -1.0], []])
 def test_a_run_without_a_curve_is_drawn(objectives, tmp_path):
     history = {"iteration": np.arange(len(objectives)), "objective": np.array(objectives)}
@@ -212,6 +219,7 @@ def test_without_models_the_source_alone_is_shown():
     ]
 
 
+@pytest.mark.exhaustive
 def test_colour_bars_are_as_high_as_their_panels_and_their_ticks_apart():
     figure = draw_result(make_view(p=1))
     figure.canvas.draw()

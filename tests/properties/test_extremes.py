@@ -106,6 +106,7 @@ def test_images(engine, solver, images, background):
     deconvolve(engine, images, mask=MASK, background=level, mu=mu, solver=solver)
 
 
+@pytest.mark.exhaustive
 def test_the_brightest_images_are_fitted_and_written(tmp_path):
     """Squares of counts were infinite in the fit of stars, and sums in the file."""
     images = expose(1.0, 1.0, 0.0)[0]

@@ -115,6 +115,7 @@ def fuzz(seeds, sound, folder):
 CASES = 150
 
 
+@pytest.mark.exhaustive
 @pytest.mark.usefixtures("limits", "quick_figures")
 def test_damaged_files_are_read_or_refused(sound, tmp_path):
     outcomes = fuzz(range(CASES), sound, tmp_path)

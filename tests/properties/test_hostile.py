@@ -268,6 +268,7 @@ def test_a_header_without_an_end_is_not_read_for_ever(
         tracemalloc.stop()
 
 
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("compress", COMPRESS)
 def test_a_compressed_file_of_many_extensions_is_read_and_leaves_none(
     tmp_path, monkeypatch, compress

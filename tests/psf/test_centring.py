@@ -63,6 +63,7 @@ def test_the_centre_is_found_where_the_position_is_off_by_five_pixels(fwhm):
         assert star.centre == pytest.approx((32.3, 31.6), abs=0.25)
 
 
+@pytest.mark.exhaustive
 def test_the_centre_of_a_clipped_star_is_found_from_its_good_pixels():
     """From the repaired pixels too, it is 0.012 pixels off (rms)."""
     rng = np.random.default_rng(0)

@@ -99,6 +99,7 @@ FRAMES = st.one_of(
 )  # fmt: skip
 
 
+@pytest.mark.exhaustive
 @given(
     frame=FRAMES,
     options=st.fixed_dictionaries(

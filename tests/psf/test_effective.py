@@ -48,6 +48,7 @@ def test_an_undersampled_star_is_not_blurred_as_one_alone_is():
     assert error(alone, 1.5) > 10 * error(together, 1.5)
 
 
+@pytest.mark.exhaustive
 def test_it_has_the_noise_of_all_stars_together():
     rng = np.random.default_rng(3)
     frame, found = a_frame(3.0) + 50.0, []
@@ -97,6 +98,7 @@ def test_two_stars_in_one_are_masked_as_no_neighbour(fwhm):
     assert error(star, fwhm) < 0.02
 
 
+@pytest.mark.exhaustive
 @pytest.mark.parametrize(("n_given", "most"), [(9, 0.01), (1, 0.02)])
 def test_stars_packed_within_the_window_are_not_its_wings(n_given, most):
     rng = np.random.default_rng(1)

@@ -72,6 +72,7 @@ def test_the_frame_given_is_not_changed():
     np.testing.assert_array_equal(mask, before[1])
 
 
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("options", [{"size": 21}, {"background": 40.0}, {"recentre": False}])
 def test_several_angles_share_what_does_not_depend_on_them(options):
     frame = STAR + np.random.default_rng(8).normal(0, 2, STAR.shape)

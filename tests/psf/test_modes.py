@@ -67,6 +67,7 @@ class TestInTheShell:
         frames = [np.pad(1e7 * psf, 16) for psf in PSFS[:12]]
         fits.writeto("frames.fits", rng.normal(frames, 1.0) + 20.0)
 
+    @pytest.mark.exhaustive
     def test_from_frames_to_a_fit(self, capsys):
         words = ["psf", "frames.fits", "--size", str(N), "--modes", "2", "-o", "psf.fits"]
         assert cli.main(words) == 0
@@ -94,6 +95,7 @@ class TestInTheShell:
                 np.linalg.norm(scatter) / norm, rel=0.1
             )
 
+    @pytest.mark.exhaustive
     @pytest.mark.parametrize(
         ("options", "message"),
         [

@@ -12,6 +12,7 @@ from lnocl.psf.make import make_psf
 from lnocl.psf.repair import MIN_GOOD, WINDOW
 
 
+@pytest.mark.exhaustive
 def test_values_of_bad_pixels_do_not_matter():
     rng = np.random.default_rng(4)
     frame = STAR + rng.normal(0, 2, STAR.shape)
@@ -51,6 +52,7 @@ def clean_fizeau():
     return shifted(fizeau(20, 128, 5, 0.7), 0.3, 0.2)[32:97, 32:97]
 
 
+@pytest.mark.exhaustive
 @pytest.mark.parametrize(("block", "error"), [(1, 2e-4), (2, 4e-3), (3, 2e-2)])
 def test_bad_pixels_are_interpolated(block, error):
     frame = clean_fizeau()

@@ -44,6 +44,7 @@ def test_a_crop_that_ends_with_the_frame_is_shifted_as_in_a_larger_one():
     assert np.abs(small.psf - whole.psf).max() < 0.03 * whole.psf.max()
 
 
+@pytest.mark.exhaustive
 @pytest.mark.parametrize(
     ("fwhm", "peak", "flux"),
     [(1.0, 8, 26), (1.5, 1.8, 7.6), (2.0, 0.38, 1.6), (2.5, 0.04, 0.18), (3.0, 0.003, 0.016)],

@@ -24,6 +24,7 @@ def a_frame(rng, n, flux, gain=1.0, widths=(3.2,)):
     return rng.poisson(light + 50.0) / gain
 
 
+@pytest.mark.exhaustive
 @pytest.mark.parametrize(("n", "flux", "gain"), [(1, 1e5, 1.0), (1, 1e4, 7.0), (3, 2e4, 1.0)])
 def test_it_is_the_error_of_the_psf_in_core_and_wings(n, flux, gain):
     """Without a gain, by one star too; one of few pixels is known to a third."""

@@ -88,6 +88,7 @@ def case(request, tmp_path_factory):
     return outcome, request.param()[0], read, parts
 
 
+@pytest.mark.exhaustive
 @pytest.mark.filterwarnings("ignore::lnocl.LnoclWarning")
 def test_a_file_gives_the_outcome_of_the_run_back(case):
     outcome, given, read, written = case
@@ -110,6 +111,7 @@ def test_a_file_gives_the_outcome_of_the_run_back(case):
         assert after.is_accepted
 
 
+@pytest.mark.exhaustive
 @pytest.mark.filterwarnings("ignore::lnocl.LnoclWarning")
 def test_maps_and_replicas_of_both_are_equal(case):
     outcome, given, parts, _ = case

@@ -45,6 +45,7 @@ def test_a_model_that_fits_is_said_to_and_nobody_is_warned():
     assert warned == []
 
 
+@pytest.mark.exhaustive
 def test_a_run_warns_of_each_fault_of_its_verdict():
     image, psf = star(widen=1.25)
     result, warned = solve(image, psf, smoothing=3.0, stop=None)

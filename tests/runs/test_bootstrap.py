@@ -77,6 +77,7 @@ def drawn_by(replicas, outcome, n):
     return np.array([replicas._draw(models, each) for each in seeds])
 
 
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("recipe", RECIPES.values(), ids=RECIPES)
 def test_counts_have_the_mean_and_variance_of_the_model(recipe):
     result = solved(recipe)
@@ -174,6 +175,7 @@ def test_stated_errors_of_stars_are_those_of_what_is_round_them():
     np.testing.assert_array_equal(less.standard_errors, alone.standard_errors)
 
 
+@pytest.mark.exhaustive
 def test_shares_of_stars_are_their_light_in_each_region():
     outcome = solved(refine_positions=True)._outcome
     found = bootstrap.without_replicas(outcome, APERTURES, 7)
@@ -195,6 +197,7 @@ def test_light_is_there_in_the_replicas_whose_errors_leave_some():
     np.testing.assert_array_equal(found.to_table()["share"], [0.5, np.nan])
 
 
+@pytest.mark.exhaustive
 def test_pixels_have_light_where_they_are_brighter_than_their_errors():
     outcome = solved()._outcome
     found = run_bootstrap(outcome, 10)
@@ -209,6 +212,7 @@ def test_pixels_have_light_where_they_are_brighter_than_their_errors():
     assert found.share_map.max() == 1.0
 
 
+@pytest.mark.exhaustive
 def test_errors_are_found_less_drawn():
     outcome = solved(refine_positions=True)._outcome
     found = run_bootstrap(outcome, 10)
@@ -237,6 +241,7 @@ def test_errors_are_found_less_drawn():
     np.testing.assert_allclose(found.error_map[inner], np.std(errors, axis=0, ddof=1), rtol=1e-4)
 
 
+@pytest.mark.exhaustive
 def test_replicas_are_continued_bit_for_bit():
     outcome = solved()._outcome
     at_once = run_bootstrap(outcome, 13)
@@ -249,6 +254,7 @@ def test_replicas_are_continued_bit_for_bit():
     np.testing.assert_array_equal(continued.error_map, at_once.error_map)
 
 
+@pytest.mark.exhaustive
 def test_processes_give_the_replicas_bit_for_bit():
     pytest.importorskip("distributed", reason="Dask is not installed")
     result = solved()
@@ -285,6 +291,7 @@ def test_intervals_are_those_of_student():
     np.testing.assert_allclose(found.interval(0.95)[:, 0], [7.0 - half, 7.0 + half])
 
 
+@pytest.mark.exhaustive
 def test_intervals_of_normal_errors_hold_the_truth_as_often_as_they_say():
     """With ten replicas, so that the factors of Student and of the mean are seen."""
     rng, held = np.random.default_rng(1), []
@@ -320,6 +327,7 @@ def test_regions_whose_errors_may_not_hold_are_named():
 # --- The scatter of PSFs
 
 
+@pytest.mark.exhaustive
 @pytest.mark.filterwarnings("ignore:the PSFs do not fit")
 def test_errors_of_psfs_are_told_apart():
     """Twice the scatter gives twice their part, and leaves the rest; without it there is none."""
@@ -403,6 +411,7 @@ def test_a_level_that_is_none_is_refused(level):
         made_up([1.0, 2.0, 4.0]).interval(level)
 
 
+@pytest.mark.exhaustive
 def test_replicas_of_something_else_are_refused():
     result = solved()
     first = result.bootstrap(10)

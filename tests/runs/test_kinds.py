@@ -185,9 +185,8 @@ def worker():
         yield
 
 
-# Of four kinds in which PSFs were judged last.
-FAST = {("PSF field + halos", "PSFs mended"), ("star PSFs + epochs", "PSFs mended")}
-FAST |= {("scaled + epochs", "PSFs doubted")}
+# One of several kinds and of much that is done.
+FAST = {("star PSFs + epochs", "PSFs mended")}
 CELLS = [
     pytest.param(*cell, marks=[] if cell in FAST else pytest.mark.exhaustive)
     for cell in product(KINDS, DONE)

@@ -49,6 +49,7 @@ def right():
     return solve()
 
 
+@pytest.mark.exhaustive
 def test_right_psfs_and_positions_are_left(right):
     assert right.psf_refinement is None
     assert right.stop_reason == "held-out"
@@ -58,6 +59,7 @@ def test_right_psfs_and_positions_are_left(right):
     np.testing.assert_array_equal(right.star_fluxes, off.star_fluxes)
 
 
+@pytest.mark.exhaustive
 @pytest.mark.parametrize(
     "psf", [blurred(0.5, 0.0, 0.5), PSF + 1e-4 * NOISE], ids=["width", "noise"]
 )
@@ -67,6 +69,7 @@ def test_psfs_that_are_exact_stay_though_they_do_not_fit(psf):
     assert found.psf_refinement.psf_error > 0.01
 
 
+@pytest.mark.exhaustive
 def test_a_star_beside_its_place_is_moved(caplog):
     caplog.set_level("INFO", "lnocl")
     found = solve(beside=(0.2, -0.1))
@@ -101,6 +104,7 @@ def few_counts(given, rms=0.0, claimed=0.0, flux=4000.0, size=48):
     return found.star_fluxes / flux, getattr(found.psf_refinement, "is_accepted", False)
 
 
+@pytest.mark.exhaustive
 def test_psfs_of_faint_stars_near_each_other_are_mended():
     """In so few counts the error of the PSF, 8 %, is not significant."""
     fluxes, is_used = few_counts(blurred(-0.2, 0.0, -0.2))
@@ -111,6 +115,7 @@ def test_psfs_of_faint_stars_near_each_other_are_mended():
     assert fluxes == pytest.approx(1.0, abs=0.08)
 
 
+@pytest.mark.exhaustive
 def test_noise_that_is_given_too_large_hides_no_wrong_psf():
     fluxes, is_used = few_counts(blurred(-0.5, 0.0, -0.5), 8.0, 40.0, 6000.0)
     assert is_used
@@ -182,6 +187,7 @@ class TestSpeckles:
     TRUE = PSF * (1.0 + 0.15 * SMOOTH / SMOOTH.std())
     TRUE = TRUE / TRUE.sum()
 
+    @pytest.mark.exhaustive
     def test_free_pixels_mend_them_and_their_error_is_allowed_for_still(self):
         found, left = solve(self.TRUE, **REFINED), solve(self.TRUE)
         assert found.psf_refinement.is_accepted
@@ -191,6 +197,7 @@ class TestSpeckles:
         assert found.star_fluxes == pytest.approx(FLUX, rel=0.01)
         assert found.psf_refinement.psf_error == pytest.approx(left.psf_refinement.psf_error)
 
+    @pytest.mark.exhaustive
     def test_left_to_stand_they_take_no_light_from_the_star(self):
         found = solve(self.TRUE, refine_psfs=["jitter"])
         assert not found.psf_refinement.is_accepted
@@ -204,10 +211,12 @@ class TestSpeckles:
         free = solve(self.TRUE, smoothing=0)
         assert free.star_fluxes < 0.95 * FLUX
 
+    @pytest.mark.exhaustive
     def test_the_answer_does_not_hang_on_the_iteration(self):
         fluxes = [solve(self.TRUE, stop=None, n_iter=n).star_fluxes for n in (60, 240)]
         assert fluxes[1] == pytest.approx(fluxes[0], rel=0.005)
 
+    @pytest.mark.exhaustive
     def test_replicas_have_it_too(self, right):
         circle = CirclePixelRegion(PixCoord(30, 30), 4.0)
         found = solve(self.TRUE, n_iter=30).bootstrap(10, regions=[circle])
@@ -216,6 +225,7 @@ class TestSpeckles:
         assert of_psfs[-1] < errors[-1] * 1.1
         assert not len(right.bootstrap(10, regions=[circle]).of_psfs)
 
+    @pytest.mark.exhaustive
     def test_it_is_said(self):
         means = FLUX * np.roll(self.TRUE, (-8, -2), (0, 1)) + LEVEL
         counts = np.random.default_rng(3).poisson(means)
@@ -229,6 +239,7 @@ class TestSpeckles:
         assert found._outcome.scene.penalty.near_stars is None
 
 
+@pytest.mark.exhaustive
 def test_psfs_of_many_stars_are_judged_only_where_that_is_asked(monkeypatch, caplog):
     monkeypatch.setattr("lnocl.core.runs.psf_refinement.MOST_STARS", 0)
     caplog.set_level("INFO", "lnocl")
@@ -238,6 +249,7 @@ def test_psfs_of_many_stars_are_judged_only_where_that_is_asked(monkeypatch, cap
     assert found.psf_refinement.is_accepted
 
 
+@pytest.mark.exhaustive
 def test_noise_is_taken_from_wings_that_are_negative():
     noisy = PSF + 1e-4 * NOISE
     found = solve(given=noisy, **REFINED)
@@ -259,6 +271,7 @@ def test_wings_without_noise_are_used_unless_they_fit_worse(kappa, is_used):
     assert (found is before) != is_used
 
 
+@pytest.mark.exhaustive
 def test_noise_of_wings_is_taken_where_no_misfit_shows_it():
     """Of nights on a host, seen through PSFs made of stars, 0.79 of the star was left."""
     sky = 60.0 * np.exp(-np.hypot(X - 32.0, (Y - 21.0) * 1.5) / 8.0)

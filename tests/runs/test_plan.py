@@ -73,6 +73,7 @@ def test_steps_of_a_scene_and_the_reasons_against_others(name):
     assert all(str(plan).count(f"{step}: no, ") == (step not in expected) for step in STEPS)
 
 
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("name", SCENES)
 @pytest.mark.filterwarnings("ignore::lnocl.LnoclWarning")
 def test_a_run_takes_the_steps_of_its_plan(name, monkeypatch):

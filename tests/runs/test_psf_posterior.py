@@ -87,6 +87,7 @@ def test_psfs_five_percent_too_narrow_are_fitted_and_the_star_is_within_its_erro
     assert wide.star_fluxes == pytest.approx(FLUX, rel=0.02)
 
 
+@pytest.mark.exhaustive
 def test_the_extended_source_gains_by_it(wide):
     with pytest.warns(lnocl.errors.LnoclWarning, match="the PSFs do not fit"):
         before = solve(1.05, refine_psfs=())
@@ -95,6 +96,7 @@ def test_the_extended_source_gains_by_it(wide):
     np.testing.assert_array_equal(before.psfs[0], psf(TRUE[0] / 1.05))
 
 
+@pytest.mark.exhaustive
 def test_it_is_said_in_one_line(caplog):
     caplog.set_level("INFO", "lnocl")
     solve(1.05, n_iter=5, stop=None)
@@ -102,6 +104,7 @@ def test_it_is_said_in_one_line(caplog):
     assert "% in width (psf_error 0 leaves them)" in line
 
 
+@pytest.mark.exhaustive
 def test_exact_psfs_stay_and_errors_hold_no_part_of_theirs(wide):
     exact, real = solve(1.0, 0.0), solve(1.0)
     np.testing.assert_array_equal(exact.psfs[0], psf(TRUE[0]))
@@ -110,6 +113,7 @@ def test_exact_psfs_stay_and_errors_hold_no_part_of_theirs(wide):
     assert exact.star_flux_errors < real.star_flux_errors
 
 
+@pytest.mark.exhaustive
 def test_errors_grow_with_what_psfs_may_have():
     errors = [
         solve(1.0, error, refine_psfs=(), n_iter=30, stop=None).star_flux_errors.item()
@@ -119,6 +123,7 @@ def test_errors_grow_with_what_psfs_may_have():
     assert errors[3] > 1.8 * errors[1]
 
 
+@pytest.mark.exhaustive
 @pytest.mark.parametrize(("error", "share"), [(0.0, 0.2), (0.03, 0.0)])
 def test_an_error_that_is_left_counts_in_fluxes_where_psfs_are_said_to_be_exact(error, share):
     found = solve(1.0, error, refine_psfs=(), n_iter=5, stop=None)._outcome
@@ -128,6 +133,7 @@ def test_an_error_that_is_left_counts_in_fluxes_where_psfs_are_said_to_be_exact(
     np.testing.assert_allclose(after, np.hypot(before, share * found.star_fluxes), rtol=1e-12)
 
 
+@pytest.mark.exhaustive
 def test_a_companion_is_not_taken_for_the_psf_where_little_is_wrong():
     companion = np.where((X == 32) & (Y == 32), 0.02 * FLUX, 0.0)
     known = {"exposure": DEPTHS[:1], "psf_error": 0.03}
@@ -145,6 +151,7 @@ def test_images_are_windows_of_one_observation_with_its_error():
     assert observation.replace(psf_error=0.0).psf_error == 0.0
 
 
+@pytest.mark.exhaustive
 def test_a_host_a_little_wider_than_the_psf_is_in_the_error_of_its_star():
     host = gaussian_filter(np.where((X == 28) & (Y == 32), 1e5, 0.0), 2.2)
     observation = observe(TRUE, TRUE, sky=host, exposure=DEPTHS, psf_error=0.03)
@@ -153,6 +160,7 @@ def test_a_host_a_little_wider_than_the_psf_is_in_the_error_of_its_star():
     assert found.star_flux_errors > 0.04 * FLUX
 
 
+@pytest.mark.exhaustive
 def test_a_file_that_ends_early_leaves_the_light_beyond_in_the_error():
     y, x = np.indices((201, 201)) - 100
     whole = (1 + (x**2 + y**2) / 4.0) ** -2.0
@@ -173,6 +181,7 @@ def settle(observation, stars=(STAR,)):
     return steps
 
 
+@pytest.mark.exhaustive
 def test_several_stars_tell_of_one_psf_and_rounds_settle():
     """Two near each other, so that their windows have more unknowns than that of the other."""
     stars = (12.3, 14.6), (40.2, 21.7), (46.8, 18.4)
@@ -201,6 +210,7 @@ def test_a_star_with_a_psf_of_its_own_tells_nothing_of_the_others(monkeypatch):
     assert not step.any()
 
 
+@pytest.mark.exhaustive
 @pytest.mark.filterwarnings("ignore:the PSFs do not fit")
 @pytest.mark.parametrize("shift", [0.04, 0.4])
 def test_stars_are_moved_that_lie_off_where_psfs_are_fitted(shift):
@@ -215,6 +225,7 @@ def test_stars_are_moved_that_lie_off_where_psfs_are_fitted(shift):
     assert not found.setup.refine_positions
 
 
+@pytest.mark.exhaustive
 @pytest.mark.filterwarnings("ignore:the PSFs do not fit")
 @pytest.mark.parametrize(("error", "is_within"), [(0.02, False), (0.05, True)])
 def test_jitter_and_pixels_are_fitted_and_fluxes_not_marginal_beyond_what_is_held(error, is_within):

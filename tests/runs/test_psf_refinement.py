@@ -86,6 +86,7 @@ def test_a_wrong_psf_is_mended(asked, families, values):
     assert error(result) < right + 0.2 * (wrong - right)
 
 
+@pytest.mark.exhaustive
 def test_its_parameters_are_found():
     true = [changed(("shift", "jitter"), v) for v in [(0.2, 0.1, 0.5, 0, 0.5), (-0.2, 0, 0, 0, 0)]]
     result = refine(images_through(true), [PSF, PSF])
@@ -96,6 +97,7 @@ def test_its_parameters_are_found():
     np.testing.assert_allclose(result.psf_refinement.values, expected, rtol=0, atol=0.08)
 
 
+@pytest.mark.exhaustive
 def test_modes_are_found():
     mode = (moffat(4.6) - PSF)[None]
     true = PSF + 1.5 * mode[0]
@@ -117,6 +119,7 @@ def test_right_psfs_are_left_as_they_are(contrast):
     np.testing.assert_array_equal(result.psfs, plain.psfs)
 
 
+@pytest.mark.exhaustive
 def test_what_parameters_cannot_mend_is_left_and_said(caplog):
     speckles = 0.3 * np.random.default_rng(2).standard_normal((N, N))
     true = PSF * np.exp(np.fft.ifft2(np.fft.fft2(speckles) * np.fft.fft2(IDEAL)).real * 8)
@@ -137,6 +140,7 @@ class TestAnErrorThatIsLeft:
     TRUE = PSF * (1.0 + 0.15 * SMOOTH / SMOOTH.std())
     TRUE = TRUE / TRUE.sum()
 
+    @pytest.mark.exhaustive
     def test_it_is_measured_and_smooths_the_sky_near_the_star(self, caplog):
         caplog.set_level("INFO", "lnocl")
         images = images_through([self.TRUE], 30.0)
@@ -170,6 +174,7 @@ def test_no_step_leads_to_psfs_of_no_light():
     np.testing.assert_array_equal(follow(*3 * [np.nan]).values, start.values)
 
 
+@pytest.mark.exhaustive
 def test_positions_are_refined_with_them():
     true = changed(("jitter",), (0.5, 0.0, 0.5))
     images = images_through([true])
@@ -178,6 +183,7 @@ def test_positions_are_refined_with_them():
     np.testing.assert_allclose(result.star_positions, [(31, 24)], rtol=0, atol=0.05)
 
 
+@pytest.mark.exhaustive
 def test_a_common_shift_is_the_stars():
     true = [changed(("shift",), (0.3, 0.1)), changed(("shift",), (0.1, -0.1))]
     result = refine(images_through(true), [PSF, PSF], ("shift",), refine_positions=True)
@@ -187,6 +193,7 @@ def test_a_common_shift_is_the_stars():
     np.testing.assert_allclose(result.star_positions, [np.add(STAR, (0.2, 0.0))], atol=0.03)
 
 
+@pytest.mark.exhaustive
 def test_the_order_of_the_images_does_not_matter():
     true = [changed(("jitter",), (0.6, 0.0, 0.2)), PSF]
     images = images_through(true)
@@ -197,6 +204,7 @@ def test_the_order_of_the_images_does_not_matter():
     np.testing.assert_allclose(*values, rtol=0, atol=2e-4)  # steps halve where rounding says
 
 
+@pytest.mark.exhaustive
 def test_images_larger_than_the_window_are_looked_at_round_the_stars(monkeypatch):
     monkeypatch.setattr("lnocl.core.runs.guarded_runs.WINDOW", 48)
     images = images_through([changed(("jitter",), (0.6, 0.0, 0.3))])
@@ -283,6 +291,7 @@ def test_a_star_may_leave_the_images_while_psfs_are_judged():
     assert abs(result.star_positions[0, 0] - 20.3) < 0.1
 
 
+@pytest.mark.exhaustive
 def test_a_run_goes_on_from_its_checkpoint_bit_for_bit(tmp_path):
     images = images_through([changed(("jitter",), (0.6, 0.0, 0.3))])
     whole = refine(images, PSF)
@@ -337,6 +346,7 @@ class TestPixels:
         options = {"n_iter": 40, "stop": None, "engine": "numpy", "pad": 0, "smoothing": 0}
         return lnocl.deconvolve(observation, self.STARS, refine_psfs=names, **options)
 
+    @pytest.mark.exhaustive
     def test_they_are_found_where_several_stars_show_them(self):
         result = self.run(self.images(self.TRUE), PSF)
         assert result.psf_refinement.is_accepted
@@ -347,6 +357,7 @@ class TestPixels:
         plain = self.run(self.images(self.TRUE), PSF, ())
         assert error(result) < 0.5 * error(plain)
 
+    @pytest.mark.exhaustive
     def test_they_keep_to_the_scatter_that_is_given(self):
         images = self.images(self.TRUE)
         scatter = abs(self.TRUE - PSF) + 1e-9
@@ -384,6 +395,7 @@ class TestAScatterThatIsGiven:
         observation = lnocl.Observation(images_through([PSF]), PSF, psf_scatter=PSF)
         assert not lnocl.plan(observation).judges_psfs
 
+    @pytest.mark.exhaustive
     def test_psfs_that_may_have_an_error_are_as_right_as_without_it(self):
         """It is among the unknowns at the star: the run is the same, and errors are larger."""
         images, scatter = images_through([PSF], 30.0), 0.05 * PSF.max() * np.ones_like(PSF)
@@ -408,6 +420,7 @@ class TestAScatterThatIsGiven:
         np.testing.assert_array_equal(beside._observation.psf_scatter, [scatter])
 
 
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("exposure", [1.0, 40.0])
 def test_what_may_be_faked_is_the_share_of_the_light_in_the_sky(exposure):
     true = TestAnErrorThatIsLeft.TRUE
@@ -427,6 +440,7 @@ def test_what_may_be_faked_is_the_share_of_the_light_in_the_sky(exposure):
     assert 0.0 < result.doubtful[y - 4 : y + 5, x - 4 : x + 5].mean() < 1.0
 
 
+@pytest.mark.exhaustive
 def test_phases_across_a_pupil_are_found():
     pupil = np.clip(12.5 - np.hypot(X - N // 2, Y - N // 2), 0.0, 1.0)
     given = Pupil(pupil)
@@ -506,6 +520,7 @@ def test_a_round_source_is_not_taken_for_the_star():
     assert found.psf_error == 0
 
 
+@pytest.mark.exhaustive
 def test_the_grid_stays_though_wider_psfs_would_take_a_larger_one():
     n, star = 60, (30, 30)
     y, x = np.indices((n, n)) - n // 2
@@ -554,6 +569,7 @@ def undersampled(oversample, width, true=1.7):
 TWO = [(16.2, 19.4), (28.6, 11.9)]
 
 
+@pytest.mark.exhaustive
 @pytest.mark.parametrize(
     ("oversample", "names"),
     [
@@ -577,6 +593,7 @@ def test_psfs_finer_than_the_images_are_refined(oversample, names):
     assert result.doubtful.shape == result.extended.shape == (40 * oversample, 40 * oversample)
 
 
+@pytest.mark.exhaustive
 def test_where_psfs_give_nothing_their_error_is_no_noise():
     """A share of the rounding in a Gaussian's wings made noise of 1e100 electrons."""
     observation = undersampled(1, width=1.4)

@@ -407,6 +407,7 @@ class TestSmoothing:
             assert reference is first[0][-1] is first[1]
             assert chosen < snapshots[-1].iteration <= 1.5 * chosen + 1
 
+    @pytest.mark.exhaustive
     @pytest.mark.parametrize("solver", ["sgm", "sgp"])
     def test_other_weights_go_on_from_a_third_of_the_iterations(self, solver):
         observation, *_ = scene()
@@ -451,6 +452,7 @@ class TestSmoothing:
         assert found == pytest.approx(gradient.std(), rel=0.04)
 
 
+@pytest.mark.exhaustive
 def test_each_phase_is_shown(monkeypatch):
     screen = Screen()
     monkeypatch.setattr("sys.stderr", screen)

@@ -85,6 +85,7 @@ def test_models_do_not_hang_on_the_unit_of_time(recipe, smoothing, oversample):
     assert worst(close, expected) <= 1e-12
 
 
+@pytest.mark.exhaustive
 def test_tiles_are_smoothed_by_one_weight_where_exposures_differ_between_them():
     seconds = np.broadcast_to(np.where(np.arange(64) < 32, 1.0, 4.0), (32, 64))
     images = np.random.default_rng(0).poisson(10.0 * seconds).astype(float)
@@ -115,6 +116,7 @@ def test_equal_exposures_are_none(engine):
         np.testing.assert_array_equal(8 * other.extended, result.extended)
 
 
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("start", ["given", "default"])
 @every_engine
 def test_what_saw_nothing_has_no_influence(engine, start):

@@ -59,6 +59,7 @@ def test_kappa_is_the_error_of_the_psfs(p, error):
     assert found.in_rings[:4] == pytest.approx(error, rel=0.35)
 
 
+@pytest.mark.exhaustive
 def test_noise_alone_is_not_significant_and_spread_as_its_variance_says():
     found = [misfit_of(*a_scene(seed=seed)) for seed in range(200)]
     z = np.array([each.significance for each in found])

@@ -37,6 +37,7 @@ def test_of_half_of_the_counts_it_is_the_same_scaled():
     np.testing.assert_allclose(found.precision, scene.star_prior.precision, rtol=1e-14)
 
 
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("solver", ["sgp", "sgm"])
 def test_iterations_end_where_the_gradients_of_data_and_prior_cancel(solver):
     """From where the data have the fluxes: the data term has to rise on the way."""

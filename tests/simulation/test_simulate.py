@@ -118,6 +118,7 @@ def test_angle_turns_from_x_to_y(perfect):
     assert turned[127 + step, 127 - step] > 0.5 * turned.max()
 
 
+@pytest.mark.exhaustive
 def test_psf_follows_its_seed():
     assert (psf_of(64, strehl=0.7, seed=5) == psf_of(64, strehl=0.7, seed=5)).all()
     assert (psf_of(64, strehl=0.7, seed=5) != psf_of(64, strehl=0.7, seed=6)).any()
@@ -217,6 +218,7 @@ def test_simulation_follows_its_seed():
     assert not np.allclose(first.psfs[0], first.psfs[1].T, rtol=1e-3)
 
 
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("size", [64, 250, 512, 1024])
 def test_hh34_is_a_jet_along_y(size):
     target = hh34(size)

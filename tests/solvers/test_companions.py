@@ -68,6 +68,7 @@ def test_points_are_found_where_they_are_though_psfs_are_wrong(wrong):
         assert flux_error < flux / 3
 
 
+@pytest.mark.exhaustive
 def test_a_point_that_is_likely_farther_off_is_taken_where_it_fits():
     place, flux = np.array([37.8, 19.2]), 1e4  # 4.5 widths
     observation = observe({tuple(place): flux}, wrong=1.03)
@@ -84,6 +85,7 @@ def test_a_point_that_is_likely_farther_off_is_taken_where_it_fits():
     assert point.significance == 9.0
 
 
+@pytest.mark.exhaustive
 def test_halos_that_are_not_known_are_in_the_errors_of_points():
     halo = np.exp(-((X - 27) ** 2 + (Y - 28) ** 2) / 4)
     observation = observe({(27.6, 27.9): 3e4}).replace(halos=halo)
@@ -106,12 +108,14 @@ NONE = {
 }
 
 
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("error", [0.03, 0.0])
 @pytest.mark.parametrize("name", NONE)
 def test_extended_sources_are_no_points(name, error):
     assert not companions(start(observe(sky=NONE[name], error=error), NONE[name]))[1]
 
 
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("wrong", [{"wrong": 1.04}, {"skew": -0.05}, {"skew": 0.2}])
 def test_errors_of_psfs_are_no_points(wrong):
     assert not companions(start(observe(**wrong)))[1]
@@ -161,6 +165,7 @@ def test_errors_beside_a_star_are_those_of_points_at_like_distances():
     assert (errors[beside] > 3 * exact[beside]).all()
 
 
+@pytest.mark.exhaustive
 @pytest.mark.filterwarnings("ignore:held-out counts have chosen")
 def test_a_companion_that_is_not_named_stays_out_of_the_psf(caplog):
     """One width away, beside a PSF 3 % too wide; a third of it went to the PSF."""
@@ -176,6 +181,7 @@ def test_a_companion_that_is_not_named_stays_out_of_the_psf(caplog):
     assert abs(result.star_fluxes[0] - FLUX) < 2 * result.star_flux_errors[0]
 
 
+@pytest.mark.exhaustive
 def test_points_are_looked_for_through_psfs_without_the_noise_of_their_wings(monkeypatch):
     observation, seen = observe(), []
     noise = 2e-4 * np.random.default_rng(2).standard_normal(observation.psfs.shape)

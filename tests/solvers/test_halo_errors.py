@@ -186,6 +186,7 @@ def test_a_window_and_what_lies_beyond_it_are_the_grid(monkeypatch, moves):
     assert abs(found[:, :k] / whole[:, :k] - 1.0).max() < 0.05
 
 
+@pytest.mark.exhaustive
 def test_a_halo_that_a_star_can_stand_in_for_leaves_no_error_and_says_so():
     scene, *_ = an_estimate()
     halo = np.array([(each @ POINT.ravel()).reshape(N, N) for each in MATRICES])

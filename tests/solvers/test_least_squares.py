@@ -32,6 +32,7 @@ for values in fit.information, change, *fields:
 """
 
 
+@pytest.mark.exhaustive
 def test_threads_of_blas_change_no_bit():
     found = {
         subprocess.run(

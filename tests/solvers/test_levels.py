@@ -109,6 +109,7 @@ def test_a_known_level_stays_and_has_no_error():
     assert (found.errors[1] > 0).all()
 
 
+@pytest.mark.exhaustive
 def test_the_error_of_a_sum_is_that_of_draws(monkeypatch):
     monkeypatch.setattr("lnocl.core.solvers.levels.SHARE", 1e-6)
     source = np.where(SKY > 4.0, SKY, 0.0)  # without wings

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scenes import named
 
 import lnocl
 from lnocl.core.scene.estimate import Estimate
@@ -99,7 +100,7 @@ PSF_AT_0 = np.roll(PSF, (-(N // 2), -(N // 2)), (0, 1))
 
 
 @pytest.mark.filterwarnings("ignore:the images are shifted")
-@pytest.mark.parametrize("known", KNOWN.values(), ids=KNOWN)
+@pytest.mark.parametrize("known", named(KNOWN, "exposure maps"))
 def test_errors_are_the_scatter_of_sums(known):
     known = {**known, "psf_centre": "given"}
     rng, n, dark = np.random.default_rng(7), 400, np.zeros(0)

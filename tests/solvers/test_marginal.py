@@ -126,6 +126,7 @@ class TestByDefault:
         observation = lnocl.Observation(counts, PSF, background=30.0)
         return lnocl.deconvolve(observation, STARS, pad=0, engine="numpy", **options)
 
+    @pytest.mark.exhaustive
     @pytest.mark.filterwarnings("ignore:held-out counts have chosen")
     def test_fluxes_are_within_their_errors(self):
         results = [self.run(seed) for seed in range(3)]

@@ -166,6 +166,7 @@ def errors_of(fit, stars):
     return np.sqrt(fluxes.variances(fit.derivatives(stars)[1].dense()))
 
 
+@pytest.mark.exhaustive
 @pytest.mark.usefixtures("whole_psfs")
 @pytest.mark.parametrize(
     "name",
@@ -190,6 +191,7 @@ def test_minimum_is_that_of_scipy(name):
     assert abs(found / errors - as_vector(stars) / errors).max() > 1.0
 
 
+@pytest.mark.exhaustive
 @pytest.mark.usefixtures("whole_psfs")
 def test_a_star_is_at_one_place_in_all_epochs():
     """Two stars in each other's light, in three images of two epochs, against SciPy."""
@@ -249,6 +251,7 @@ def fitted(observation, given, level, flux):
     return values, errors / np.sqrt(scene.scale)
 
 
+@pytest.mark.exhaustive
 def test_scatter_is_what_the_errors_say():
     """Of 100 realisations; the sum of squares over the errors' has a chi-square distribution."""
     truth, level, n = np.array([2000.0, 15.3, 16.4]), 5.0, 100

@@ -146,6 +146,7 @@ KNOWN = {
 }
 
 
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("kind", KNOWN)
 def test_slopes_of_images_are_those_of_stars_through_changed_psfs(kind):
     known = KNOWN[kind] | {"psf_error": 0.03}

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scenes import named
 from scipy.ndimage import gaussian_filter
 
 import lnocl
@@ -52,7 +53,7 @@ def families(scene, names=NAMES):
     return PsfFamilies(names, given, 0.1 * PSFS)
 
 
-@pytest.mark.parametrize("known", KNOWN.values(), ids=KNOWN)
+@pytest.mark.parametrize("known", named(KNOWN, "exposures", "own PSF"))
 def test_slopes_are_the_derivatives_of_the_models(known):
     family = families(a_scene(**known))
     scene = a_scene(family.psfs(family.first()), **known)
@@ -122,6 +123,7 @@ def wide_scene(changed, stars=STARS, **known):
     return Scene(observation, stars, pad=20)
 
 
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("known", IN_FRAMES.values(), ids=IN_FRAMES)
 def test_slopes_and_pixels_of_images_with_frames_and_psfs_of_their_own(known):
     """Models turn PSFs and the extended source by shears; slopes take their spectra."""
@@ -159,6 +161,7 @@ def test_slopes_and_pixels_of_images_with_frames_and_psfs_of_their_own(known):
 
 
 # Fast tests have each setting with moving stars and with others; CI has all.
+@pytest.mark.exhaustive
 @pytest.mark.parametrize(
     ("known", "moves", "names"),
     [

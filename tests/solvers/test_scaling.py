@@ -106,6 +106,7 @@ def test_cross_information_lies_in_a_window(psf_shape, offsets):
 FAR, CLOSE, ROUND_THE_EDGE = [(40, 50)], [(40, 50), (47.3, 52.6)], [(0.2, 1.0), (94.0, 3.0)]
 
 
+@pytest.mark.exhaustive
 @pytest.mark.parametrize("stars", [[], FAR, CLOSE, ROUND_THE_EDGE])
 @pytest.mark.filterwarnings("ignore:psf . is sharper")
 def test_shift_is_that_of_the_whole_grid(stars):

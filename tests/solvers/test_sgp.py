@@ -261,6 +261,7 @@ def test_objective_never_rises_in_any_scene(scene, mu):
     assert falls(result)
 
 
+@pytest.mark.exhaustive
 @pytest.mark.filterwarnings("ignore:.*lies on bad pixels")
 @given(scene=small_scenes(logarithmic(-3, 3)), mu=logarithmic(-5, 1))
 def test_convergence_is_claimed_at_the_minimum_alone(scene, mu):

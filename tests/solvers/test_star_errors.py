@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scenes import named
 from scipy.linalg import cho_factor, cho_solve
 from scipy.ndimage import gaussian_filter
 
@@ -145,8 +146,8 @@ def dense(scene, sky, fluxes, moves):
 
 
 @pytest.mark.filterwarnings("ignore:the images are shifted")
-@pytest.mark.parametrize("known", KNOWN.values(), ids=KNOWN)
-@pytest.mark.parametrize("moves", [False, True])
+@pytest.mark.parametrize("known", named(KNOWN, "masked and moved", "doubted PSFs"))
+@pytest.mark.parametrize("moves", [pytest.param(False, marks=pytest.mark.exhaustive), True])
 def test_errors_are_those_of_the_dense_matrix(known, moves, monkeypatch):
     rough = standard_errors(Estimate(*a_scene(**known)), moves)
     monkeypatch.setattr(least_squares, "MISSING", 1e-12)

@@ -172,6 +172,7 @@ class TestCommand:
         np.testing.assert_allclose(found, expected, rtol=0.06, atol=1e-12)
         assert lines[-1].startswith("for an accuracy of 0.01: ")
 
+    @pytest.mark.exhaustive
     @pytest.mark.usefixtures("numpy_only")
     def test_the_demo_has_a_truth(self, capsys):
         assert run("--size", "64") == 0

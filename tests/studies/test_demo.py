@@ -75,6 +75,7 @@ class TestDemo:
         assert rows[1][3] == f"{fluxes[0] / fluxes[1] - 1:+.2%}"
         assert float(rows[0][2].rstrip("%")) > float(rows[1][2].rstrip("%"))
 
+    @pytest.mark.exhaustive
     def test_the_command_in_a_result_repeats_it(self, run, folder, monkeypatch):
         files, _ = run
         header = fits.getheader(files / "mc-rl.fits")
@@ -91,6 +92,7 @@ class TestDemo:
             again.tables["HISTORY"]["objective"], first.tables["HISTORY"]["objective"]
         )
 
+    @pytest.mark.exhaustive
     def test_without_matplotlib_it_says_what_to_install(self, capsys, monkeypatch):
         monkeypatch.setitem(sys.modules, "matplotlib", None)
         monkeypatch.setattr(demo, "N_ITER", 20)
@@ -151,6 +153,7 @@ class TestSimulate:
         assert cli.main(["simulate", "hh34", *SMALL, "-o", "text/out"]) == 1
         assert "text/out cannot be used" in one_complaint(capsys.readouterr())
 
+    @pytest.mark.exhaustive
     def test_the_files_hold_the_simulation(self, capsys):
         options = ("--exposure-time", "10 min", "--extended-magnitude", "12", "--seed", "3")
         arguments = ["hh34", *SMALL, "--angle", "0", "-60", "--star", "20,30,11.5"]
@@ -264,6 +267,7 @@ class TestPlot:
         ]
         assert os.listdir("out") == ["result.png"]
 
+    @pytest.mark.exhaustive
     def test_several_results_of_several_stars_are_compared(self, capsys):
         cubes = {name: np.ones((1, 32, 32)) for name in ("MODELS", "RESIDUALS")}
         for name in "ab":

@@ -159,6 +159,7 @@ def test_a_reconstruction_strays_by_the_worst_of_what_it_returns(monkeypatch, k)
     assert all(row.measured == pytest.approx(1e-3) for row in selftest.run())
 
 
+@pytest.mark.exhaustive
 @pytest.mark.parametrize(
     "name", ["correlate_columns", pytest.param("convolve_columns", marks=pytest.mark.exhaustive)]
 )
