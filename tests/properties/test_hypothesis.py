@@ -152,7 +152,7 @@ def test_anything_is_answered_or_refused(case):
 
 
 @pytest.mark.exhaustive
-@settings(repeated, max_examples=5000)
+@settings(repeated, max_examples=2000)
 @given(anything())
 def test_anything_is_answered_or_refused_more(case):
     answers(case, engine="numpy")

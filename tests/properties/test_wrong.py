@@ -20,8 +20,7 @@ def wrong(monkeypatch):
 
 @pytest.mark.exhaustive
 @pytest.mark.filterwarnings("ignore::lnocl.LnoclWarning")
-@pytest.mark.parametrize("contrast", [10.0, 0.3])
-@pytest.mark.parametrize("kind", ["moffat", "halo"])
+@pytest.mark.parametrize(("kind", "contrast"), [("moffat", 0.3), ("halo", 10.0)])
 def test_fourteen_wrong_psfs_are_reported_and_the_right_one_is_not(kind, contrast, wrong):
     image, *_ = wrong.make_scene(kind, contrast, seed=7)
     for name, psf in wrong.wrong_psfs(kind):

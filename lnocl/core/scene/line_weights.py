@@ -9,6 +9,7 @@ are.
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -64,20 +65,31 @@ def are_whole(places: Array) -> bool:
 
 def whole_and_weights(places: Array) -> tuple[NDArray[np.int64], Array]:
     """Return the whole pixels of places, shape (n,), and the weights of what is left."""
+    return _of_places(np.asarray(places, float).tobytes())
+
+
+@lru_cache(maxsize=256)  # iterations shift the same lines each time
+def _of_places(content: bytes) -> tuple[NDArray[np.int64], Array]:
+    places = np.frombuffer(content)
     whole = np.floor(places)
+    weights = shift_weights(places - whole)
     if are_whole(places):
-        return whole.astype(int), np.tile(np.arange(TAPS) == TAPS // 2 - 1, (len(places), 1)) * 1.0
-    return whole.astype(int), shift_weights(places - whole)
+        weights = np.tile(np.arange(TAPS) == TAPS // 2 - 1, (len(places), 1)) * 1.0
+    weights.flags.writeable = False
+    return whole.astype(int), weights
 
 
 def shifted(rows: Array, shifts: Array, sign: int) -> Array:
     """Return rows, each shifted round its end; the adjoint for a sign of -1."""
     whole, weights = whole_and_weights(shifts)
     n = rows.shape[1]
+    first = 1 - TAPS // 2 if sign > 0 else -TAPS // 2
+    places = np.arange(n + TAPS - 1) + first + sign * whole[:, None]
+    longer = np.take_along_axis(rows, places % n, axis=1)
     total = np.zeros_like(rows)
     for k in range(TAPS):
-        places = np.arange(n) + sign * (whole[:, None] - TAPS // 2 + 1 + k)
-        total += weights[:, k, None] * np.take_along_axis(rows, places % n, axis=1)
+        at = k if sign > 0 else TAPS - 1 - k
+        total += weights[:, k, None] * longer[:, at : at + n]
     return total
 
 

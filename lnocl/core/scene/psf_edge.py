@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -137,6 +138,12 @@ def psf_edge(psf: Array) -> PsfEdge:
     0.58 %, 0.00 %
     """
     psf = psf / psf.sum()
+    return _edge_of(np.asarray(psf, float).tobytes(), psf.shape)
+
+
+@lru_cache(maxsize=16)  # all fits of a run ask for the same few
+def _edge_of(content: bytes, shape: tuple[int, int]) -> PsfEdge:
+    psf = np.frombuffer(content).reshape(shape)
     known, r = _known(psf), _radii(psf.shape)
     radius, furthest = _reach(known), float(r[known].max())
     if radius < LEAST_RADIUS:
