@@ -13,8 +13,7 @@ import numpy as np
 from lnocl.core.scene.arrays import Array
 from lnocl.core.scene.estimate import Estimate
 from lnocl.core.scene.texture import resolution
-from lnocl.core.solvers.companions import Companion, holding
-from lnocl.core.solvers.fluxes import variances
+from lnocl.core.solvers.companions import Companion, holding, step_of
 from lnocl.core.solvers.near_star import NearStar, Surroundings
 
 # The share of the gradient at which conjugate gradients end.
@@ -43,16 +42,10 @@ def point_flux(
     raised : ndarray of float64, shape (n_shapes,)
         As of `lnocl.core.solvers.halos.halo_errors`: halos are unknown too.
     """
-    n, n_epochs = estimate.scene.n_stars, estimate.scene.n_epochs
+    scene = estimate.scene
     point = Companion(place, max(flux, 0.0), np.zeros(3), 0.0)
-    other = holding(estimate, [point], resolution(estimate.scene))
-    near = NearStar(Surroundings(other, moves, raised, holds_shapes=True), n, FINISHED)
-    at = np.array([np.flatnonzero(near.held == s)[0] for s in range(n, n + n_epochs)])
-    at = at[np.isfinite(variances(near.fit.information)[at])]
-    if not len(at):
-        return 0.0, np.inf
-    change, _ = near.fit.solve()
-    values = point.flux + change[at] * estimate.scene.unit
-    weights = 1.0 / near.fit.variances(at)
-    mean = float((weights * values).sum() / weights.sum())
-    return mean, float(weights.sum() ** -0.5) * estimate.scene.unit
+    other = holding(estimate, [point], resolution(scene))
+    around = Surroundings(other, moves, raised, holds_shapes=True)
+    near = NearStar(around, scene.n_stars, FINISHED)
+    change, error, *_ = step_of(near, scene.n_stars, scene.n_epochs)
+    return (point.flux + change * scene.unit if error < np.inf else 0.0), error * scene.unit

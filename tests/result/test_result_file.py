@@ -106,7 +106,13 @@ def mended_and_chosen():
     return both(*words, "--refine-psfs", "jitter", numbers=[3], **options)
 
 
-@pytest.fixture(scope="module", params=[epochs_and_halos, psf_errors, turned, mended_and_chosen])
+RUNS = [
+    *(epochs_and_halos, pytest.param(psf_errors, marks=pytest.mark.exhaustive)),
+    *(pytest.param(turned, marks=pytest.mark.exhaustive), mended_and_chosen),
+]
+
+
+@pytest.fixture(scope="module", params=RUNS)
 def case(request, files):
     return request.param, request.param()
 

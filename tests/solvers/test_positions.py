@@ -395,7 +395,7 @@ def test_stars_are_moved_after_3_6_and_12_iterations(solver):
     assert seen[0] != tuple((RUN.make().stars + OFF)[0])
 
 
-@pytest.mark.parametrize("solver", ["sgm", "sgp"])
+@pytest.mark.parametrize("solver", [pytest.param("sgm", marks=pytest.mark.exhaustive), "sgp"])
 @pytest.mark.parametrize("engine", FEWER_ENGINES[1:])
 def test_engines_agree(engine, solver):
     expected = reference_run(solver)

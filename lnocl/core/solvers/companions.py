@@ -276,16 +276,27 @@ def _fitted(
     Its flux is the mean over epochs.
     """
     near = NearStar(Surroundings(estimate, True, raised), first, FINISHED)
-    there = np.arange(first, first + estimate.scene.n_epochs)
-    at = near.unknowns[np.isin(near.held, there)]
+    change, change_error, step, step_errors = step_of(near, first, estimate.scene.n_epochs)
+    flux = point.flux + change * estimate.scene.unit
+    if flux <= 0:
+        return None
+    errors = np.array([change_error * estimate.scene.unit, *step_errors])
+    place = point.place + step.clip(-MOVED, MOVED)
+    return Companion(place, flux, errors, point.significance)
+
+
+def step_of(near: NearStar, first: int, n_epochs: int) -> tuple[float, float, Array, Array]:
+    """Return how a star changes, in the mean of its epochs from `first` on, where it fits best.
+
+    That is the change of its flux, scaled, and its error; and of its place, and theirs, empty where
+    stars do not move. The flux is minus infinity where no epoch determines it.
+    """
+    at = near.unknowns[np.isin(near.held, np.arange(first, first + n_epochs))]
     at = at[np.isfinite(variances(near.fit.information)[at]).all(axis=1)]
     if not len(at):
-        return None
+        return -np.inf, np.inf, np.zeros(0), np.zeros(0)
     change, _ = near.fit.solve()
-    unit = estimate.scene.unit
-    values = point.flux + change[at[:, 0]] * unit
-    weights = 1.0 / near.fit.variances(at[:, 0]) / unit**2
-    flux = float((weights * values).sum() / weights.sum())
-    place = point.place + change[at[0, 1:]].clip(-MOVED, MOVED)
-    errors = [weights.sum() ** -0.5, *np.sqrt(near.fit.variances(at[0, 1:]))]
-    return Companion(place, flux, np.array(errors), point.significance) if flux > 0 else None
+    weights = 1.0 / near.fit.variances(at[:, 0])
+    mean = float((weights * change[at[:, 0]]).sum() / weights.sum())
+    errors = np.sqrt(near.fit.variances(at[0, 1:]))
+    return mean, float(weights.sum() ** -0.5), change[at[0, 1:]], errors
