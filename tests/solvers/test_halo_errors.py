@@ -219,9 +219,9 @@ def test_a_faint_star_that_is_like_a_halo_is_as_unknown_beside_five_bright_ones(
 @pytest.mark.exhaustive
 @pytest.mark.parametrize(("width", "light"), [(0.7, 0.0), (2.0, 0.0), (0.7, 0.3)])
 def test_fluxes_beside_a_halo_scatter_as_their_errors_say(width, light):
-    """Of 200 scenes of two images that differ in depth and PSF; 200 tell the ratio to 5 %.
+    """Of 60 scenes of two images that differ in depth and PSF; 60 tell the ratio to 9 %.
 
-    Measured 0.86, 0.86 and 1.05, of halos 0.96, 1.0 and 1.26: with light under the star, too.
+    Of 200: 0.86, 0.86 and 1.05, of halos 0.96, 1.0 and 1.26: with light under the star, too.
     """
     halo = blurred(POINT, width)[None]
     halo /= halo.sum(axis=(2, 3), keepdims=True)
@@ -231,7 +231,7 @@ def test_fluxes_beside_a_halo_scatter_as_their_errors_say(width, light):
     mean += AMOUNTS[0][:, None, None] * halo[0]
     known = {"background": LEVEL, "exposure": EXPOSURE, "halos": halo, "psf_centre": "given"}
     pulls, halo_pulls = [], []
-    for seed in range(200):
+    for seed in range(60):
         counts = np.random.default_rng(seed).poisson(mean).astype(float)
         observation = lnocl.Observation(counts, PSFS, **known)
         result = lnocl.deconvolve(observation, [(x, y)], stop=None, n_iter=15, engine="numpy")
