@@ -115,6 +115,13 @@ def test_the_extended_source_may_be_a_jet_but_no_point(result, place, is_point):
         assert flux == pytest.approx(2000, rel=0.15)
 
 
+def test_a_point_of_no_flux_has_an_error_though_its_place_has_none(result):
+    estimate = result._outcome.estimate
+    flux, error = point_flux(estimate, np.array([20.0, 40.0]), -5.0, True, np.zeros(0))
+    assert np.isfinite(flux)
+    assert 0 < error < np.inf
+
+
 def test_a_point_is_told_from_the_extended_source_with_shapes_of_psfs_held(result, monkeypatch):
     exact, found = result._outcome.estimate, []
     monkeypatch.delattr(PsfErrors, "slopes")

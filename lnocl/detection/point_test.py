@@ -47,5 +47,5 @@ def point_flux(
     other = holding(estimate, [point], resolution(scene))
     around = Surroundings(other, moves, raised, holds_shapes=True)
     near = NearStar(around, scene.n_stars, FINISHED)
-    change, error, *_ = step_of(near, scene.n_stars, scene.n_epochs)
+    change, error, _ = step_of(near, scene.n_stars, scene.n_epochs)
     return (point.flux + change * scene.unit if error < np.inf else 0.0), error * scene.unit

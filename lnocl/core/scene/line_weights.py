@@ -71,12 +71,12 @@ def whole_and_weights(places: Array) -> tuple[NDArray[np.int64], Array]:
 @lru_cache(maxsize=256)  # iterations shift the same lines each time
 def _of_places(content: bytes) -> tuple[NDArray[np.int64], Array]:
     places = np.frombuffer(content)
-    whole = np.floor(places)
-    weights = shift_weights(places - whole)
+    floor = np.floor(places)
+    whole, weights = floor.astype(int), shift_weights(places - floor)
     if are_whole(places):
         weights = np.tile(np.arange(TAPS) == TAPS // 2 - 1, (len(places), 1)) * 1.0
-    weights.flags.writeable = False
-    return whole.astype(int), weights
+    whole.flags.writeable = weights.flags.writeable = False
+    return whole, weights
 
 
 def shifted(rows: Array, shifts: Array, sign: int) -> Array:

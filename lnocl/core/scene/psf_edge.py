@@ -145,6 +145,7 @@ def psf_edge(psf: Array) -> PsfEdge:
 def _edge_of(content: bytes, shape: tuple[int, int]) -> PsfEdge:
     psf = np.frombuffer(content).reshape(shape)
     known, r = _known(psf), _radii(psf.shape)
+    known.flags.writeable = False
     radius, furthest = _reach(known), float(r[known].max())
     if radius < LEAST_RADIUS:
         return PsfEdge(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, LEAST_EXPONENT, 0.0, radius, known)

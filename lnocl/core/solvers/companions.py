@@ -276,27 +276,26 @@ def _fitted(
     Its flux is the mean over epochs.
     """
     near = NearStar(Surroundings(estimate, True, raised), first, FINISHED)
-    change, change_error, step, step_errors = step_of(near, first, estimate.scene.n_epochs)
-    flux = point.flux + change * estimate.scene.unit
-    if flux <= 0:
+    change, change_error, step = step_of(near, first, estimate.scene.n_epochs)
+    flux, at = point.flux + change * estimate.scene.unit, near.unknowns[0, 1:]
+    if flux <= 0 or not np.isfinite(variances(near.fit.information)[at]).all():
         return None
-    errors = np.array([change_error * estimate.scene.unit, *step_errors])
-    place = point.place + step.clip(-MOVED, MOVED)
+    errors = np.array([change_error * estimate.scene.unit, *np.sqrt(near.fit.variances(at))])
+    place = point.place + step[at].clip(-MOVED, MOVED)
     return Companion(place, flux, errors, point.significance)
 
 
-def step_of(near: NearStar, first: int, n_epochs: int) -> tuple[float, float, Array, Array]:
-    """Return how a star changes, in the mean of its epochs from `first` on, where it fits best.
+def step_of(near: NearStar, first: int, n_epochs: int) -> tuple[float, float, Array]:
+    """Return how the flux of a star changes, in the mean of its epochs from `first` on.
 
-    That is the change of its flux, scaled, and its error; and of its place, and theirs, empty where
-    stars do not move. The flux is minus infinity where no epoch determines it.
+    That is the change, scaled, and its error, minus and plus infinity where no epoch determines it;
+    and the changes of all unknowns.
     """
-    at = near.unknowns[np.isin(near.held, np.arange(first, first + n_epochs))]
-    at = at[np.isfinite(variances(near.fit.information)[at]).all(axis=1)]
+    at = near.unknowns[np.isin(near.held, np.arange(first, first + n_epochs)), 0]
+    at = at[np.isfinite(variances(near.fit.information)[at])]
     if not len(at):
-        return -np.inf, np.inf, np.zeros(0), np.zeros(0)
+        return -np.inf, np.inf, np.zeros(near.n)
     change, _ = near.fit.solve()
-    weights = 1.0 / near.fit.variances(at[:, 0])
-    mean = float((weights * change[at[:, 0]]).sum() / weights.sum())
-    errors = np.sqrt(near.fit.variances(at[0, 1:]))
-    return mean, float(weights.sum() ** -0.5), change[at[0, 1:]], errors
+    weights = 1.0 / near.fit.variances(at)
+    mean = float((weights * change[at]).sum() / weights.sum())
+    return mean, float(weights.sum() ** -0.5), change
