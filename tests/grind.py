@@ -27,28 +27,28 @@ DTYPES = {"s": np.float32, "d": np.float64}
 ON_GPU = "as on a GPU"
 DECONVOLUTION = "deconvolution"
 
-# As those of kernel_cases.py, and smaller: grid, tuning, scene, precisions. Without a tuning the
+# As those of kernel_cases.py, and smaller: grid, tuning, scene, precision. Without a tuning the
 # one for a CPU, of one work-item a group; in a group of several, all barriers count.
 CASES = {
-    "smallest grid": ((2, 2), None, "two images, star, mu", "sD"),
+    "smallest grid": ((2, 2), None, "two images, star, mu", "s"),
     "an item a block": ((16, 16), None, harness.THREE_IMAGES, "d"),
     "several vectors a block": ((16, 16), Tuning(4, 8), "exposure map, mu", "S"),
     "middle passes and spans": ((128, 4), Tuning(2, 2, chunk=8), "mask, mu, smoothing", "S"),
-    "odd factors 3 and 5": ((12, 40), Tuning(2, 2, chunk=2), harness.THREE_IMAGES, "sD"),
-    "odd factors 7 and 9": ((28, 36), Tuning(2, 2), "exposure map, mu", "Sd"),
-    "group": ((16, 32), ON_GPU, harness.THREE_IMAGES, "Sd"),
+    "odd factors 3 and 5": ((12, 40), Tuning(2, 2, chunk=2), harness.THREE_IMAGES, "s"),
+    "odd factors 7 and 9": ((28, 36), Tuning(2, 2), "exposure map, mu", "d"),
+    "group": ((16, 32), ON_GPU, harness.THREE_IMAGES, "d"),
     "sky twice as fine": ((16, 24), Tuning(2, 2), harness.TWICE_AS_FINE, "s"),
     "group, sky four times as fine": (
         (16, 32),
         Tuning(1, 2, group=4),
         FOUR_TIMES_AS_FINE,
-        "sd",
+        "s",
     ),
-    "turned": ((16, 32), Tuning(4, 4), harness.TURNED, "sD"),
-    "group, turned": ((32, 48), Tuning(1, 4, group=4), harness.TURNED, "sd"),
+    "turned": ((16, 32), Tuning(4, 4), harness.TURNED, "D"),
+    "group, turned": ((32, 48), Tuning(1, 4, group=4), harness.TURNED, "s"),
     "group, exposure map": ((32, 16), Tuning(1, 8, group=4), "exposure map, mu", "s"),
     "group, mu": ((16, 16), ON_GPU, "two images, star, mu", "D"),
-    "group, odd factors": ((36, 40), Tuning(1, 2, group=4), "mask, mu, smoothing", "sD"),
+    "group, odd factors": ((36, 40), Tuning(1, 2, group=4), "mask, mu, smoothing", "d"),
     "group larger than its work": ((8, 8), Tuning(1, 2, group=16), "mask, mu, smoothing", "s"),
     "group of vectors": ((16, 16), Tuning(4, 8, group=2), "mask, mu, smoothing", "D"),
     "group, middle pass along x": ((4, 128), Tuning(1, 2, group=16, chunk=8), "plain", "s"),
@@ -58,10 +58,10 @@ CASES = {
         (32, 32),
         Tuning(1, 2, group=4, scratch_is_global=True),
         "mask, mu, smoothing",
-        "sD",
+        "s",
     ),
-    "group, deconvolution": ((16, 16), ON_GPU, DECONVOLUTION, "sD"),
-    "deconvolution": ((16, 16), None, DECONVOLUTION, "SD"),
+    "group, deconvolution": ((16, 16), ON_GPU, DECONVOLUTION, "s"),
+    "deconvolution": ((16, 16), None, DECONVOLUTION, "D"),
 }
 # Fewer groups than blocks to share the scratch.
 DEVICE_OPTIONS = {"group, global scratch": ["--compute-units", "1"]}

@@ -300,13 +300,13 @@ def test_a_point_in_images_of_two_scales_is_found_once(seed):
 @pytest.mark.exhaustive
 @pytest.mark.parametrize("mix", ["faint", "depths", "bars", "scales", "coarse"])
 def test_images_that_differ_raise_as_many_alarms_as_stated(mix):
-    """Of 12 fields, 2 in each; a point is found once in each of the same."""
+    """Of 8 fields, 2 in each; a point is found once in each of the same."""
     scenes = Path(__file__).parents[1] / "benchmarks" / "mixes.py"
     measure = runpy.run_path(str(scenes))["measure"]
-    rows = np.array([measure((mix, 2.0, 600 + seed)) for seed in range(12)], float)
-    assert rows[:, 0].mean() == pytest.approx(2.0, abs=3 * np.sqrt(2.0 / 12))
-    assert (rows[:, 1] == 1).sum() >= 11
-    assert (rows[:, 2] == 1).sum() >= 10
+    rows = np.array([measure((mix, 2.0, 600 + seed)) for seed in range(8)], float)
+    assert rows[:, 0].mean() == pytest.approx(2.0, abs=3 * np.sqrt(2.0 / 8))
+    assert (rows[:, 1] == 1).sum() >= 7
+    assert (rows[:, 2] == 1).sum() >= 7
     assert np.median(rows[:, 3]) < 1.3 * np.median(rows[:, 4])
     assert 0.85 * 9.0 < rows[:, 5].mean() < 9.3
 

