@@ -143,6 +143,7 @@ class OpenCLEngine:
         self._queue = self._launcher.queue
         self._memory = Memory(self._queue, self.layout, scene.scale)
         self._observed: NDArray[np.bool_] | None = None
+        self._star_fluxes: Array | None = None  # as they are on the device, where that is known
         self._memory.allocate(**sizes)
         self._upload_scene()
         self._bind_iteration()
@@ -337,7 +338,7 @@ class OpenCLEngine:
             extended = np.where(self._observed, extended, 0.0)
         memory.upload_pixels("extended", [extended])
         self._transform_estimate()
-        memory.upload("star_fluxes", star_fluxes)
+        self.set_star_fluxes(star_fluxes)
         squares = np.zeros(memory.count("square_sums"))
         squares[0] = np.einsum("yx,yx->", extended, extended)
         memory.upload("square_sums", squares)
@@ -372,6 +373,7 @@ class OpenCLEngine:
         """Scale the estimate by its correction; fetch the objectives of some iterations ago."""
         event = self._scale()
         self._convolve()
+        self._star_fluxes = None
         self._n_scaled += 1
         if self._n_scaled % ITERATIONS_AHEAD == 0:
             if self._last_mark is not None:
@@ -402,7 +404,7 @@ class OpenCLEngine:
         """Return the gradient of the objective in the star fluxes."""
         if not self.scene.n_fluxes:
             return np.zeros(0)  # without waiting for the device
-        return -self._wait_for_objective()[2]
+        return -self._wait_for_objective()[1]
 
     def step(self, alpha: float, share: float) -> tuple[float, Array]:
         """Step from the base; return ``<gradient, d>`` and ``<cross_information_s, d>``."""
@@ -418,24 +420,23 @@ class OpenCLEngine:
 
     def set_star_fluxes(self, star_fluxes: Array) -> None:
         """Make these the star fluxes."""
-        self._memory.upload("star_fluxes", star_fluxes)
+        self._star_fluxes = self._memory.upload("star_fluxes", star_fluxes)
 
     def objective(self) -> float:
         """Return the objective recorded last, scaled."""
         return self._wait_for_objective()[0]
 
-    def _wait_for_objective(self) -> tuple[float, float, Array]:
-        """Return the objective recorded last, its data term, and ``sum_j <P_js, r_j - w_j>``."""
+    def _wait_for_objective(self) -> tuple[float, Array]:
+        """Return the objective recorded last, and ``sum_j <P_js, r_j - w_j>``."""
         if self._pending_objective is None:
             self._pending_objective = self._fetch_objective()
-        objective, data_term, stars = self._pending_objective.wait()
+        objective, stars = self._pending_objective.wait()
         star_sums = stars.reshape(-1, 2).sum(axis=1)[: self.scene.n_fluxes]
-        return float(objective.sum()), float(data_term.sum()), star_sums
+        return float(objective.sum()), star_sums
 
     def _fetch_objective(self) -> Transfer:
         return self._memory.fetch_ranges(
             ("objectives", 2 * (self._n_objectives - 1), 2),
-            ("data_term", 0, 2),
             ("star_totals", 0, self._memory.count("star_totals")),
         )
 
@@ -450,11 +451,13 @@ class OpenCLEngine:
 
     def star_fluxes(self) -> Array:
         """Return the star fluxes, scaled."""
-        return self._memory.download("star_fluxes", self.scene.n_fluxes)
+        if self._star_fluxes is None:
+            self._star_fluxes = self._memory.download("star_fluxes", self.scene.n_fluxes)
+        return self._star_fluxes.copy()
 
     def data_term(self) -> float:
         """Return the data term of the objective recorded last, scaled."""
-        return self._wait_for_objective()[1]
+        return float(self._memory.download("data_term", 2).sum())
 
     def objectives(self) -> Array:
         """Return the objectives recorded so far, scaled."""
@@ -480,6 +483,7 @@ class OpenCLEngine:
 
     def restore(self, state: State) -> None:
         """Continue from this state."""
+        self._star_fluxes = None
         for name in self._stateful:
             self._memory.upload_raw(name, state[name])
         self._transform_estimate()

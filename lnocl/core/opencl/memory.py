@@ -71,6 +71,7 @@ class Memory:
     def __init__(self, queue: cl.CommandQueue, layout: Layout, scale: float) -> None:
         self._queue, self._layout, self._scale = queue, layout, scale
         self.buffers: dict[str, cl.Buffer] = {}
+        self._uploads: dict[str, cl.Event] = {}
 
     def allocate(self, **sizes: int) -> None:
         """Make buffers of so many bytes, in the place of those with the same names."""
@@ -93,10 +94,15 @@ class Memory:
         buffers = self.buffers
         buffers[one], buffers[other] = buffers[other], buffers[one]
 
-    def upload(self, name: str, values: NDArray) -> None:
-        """Copy numbers to a buffer, in the precision of the device."""
-        if np.size(values):
-            cl.enqueue_copy(self._queue, self.buffers[name], self._rounded(name, values))
+    def upload(self, name: str, values: NDArray) -> Array:
+        """Copy numbers to a buffer, not waiting for the device; return them in its precision."""
+        rounded = self._rounded(name, values)
+        if rounded.size:
+            # An event that is let go waits for its copy.
+            self._uploads[name] = cl.enqueue_copy(
+                self._queue, self.buffers[name], rounded, is_blocking=False
+            )
+        return rounded.astype(np.float64)
 
     def upload_integers(self, name: str, values: NDArray) -> None:
         """Copy whole numbers of 32 bits to a buffer."""

@@ -9,6 +9,7 @@ import re
 import weakref
 from collections import OrderedDict
 from collections.abc import Mapping
+from functools import lru_cache
 from pathlib import Path
 from typing import cast
 
@@ -166,7 +167,7 @@ class Program:
         self.options = ["-cl-std=CL1.2", "-w", *definitions]
         text = source()
         self._built = _build(context, text, tuple(self.options))
-        self.arguments = _arguments(text, self._built.kernel_names)
+        self.arguments = _arguments(text, tuple(self._built.kernel_names))
         self._kernels: dict[str, cl.Kernel] = {}
         weakref.finalize(self, self._built.store)
 
@@ -216,7 +217,8 @@ def _has_builtin_prefetch(device: cl.Device) -> bool:
     return device.platform.name == unknown_cpu.POCL and bool(device.type & cl.device_type.CPU)
 
 
-def _arguments(text: str, kernel_names: list[str]) -> Mapping[str, tuple[str, ...]]:
+@lru_cache(maxsize=MAX_PROGRAMS)
+def _arguments(text: str, kernel_names: tuple[str, ...]) -> Mapping[str, tuple[str, ...]]:
     """Return the names of the arguments that the source declares for each kernel."""
     declared = dict(re.findall(r"^KERNEL void (\w+)\(([^)]*)\)", text, re.MULTILINE))
     return {
