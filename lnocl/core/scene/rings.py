@@ -9,6 +9,8 @@ from lnocl.core.scene.arrays import Array
 
 # A ring is a pixel wide, or this share of its radius.
 WIDTH = 0.15
+# A tree finds the nearest of more stars than this sooner than all of them are tried.
+FEW = 16
 
 
 class Rings:
@@ -32,8 +34,7 @@ class Rings:
     """
 
     def __init__(self, shape: tuple[int, int], positions: Array, oversample: int = 1) -> None:
-        y, x = np.indices(shape)
-        distance = KDTree(positions).query(np.stack([x, y], axis=-1))[0] / oversample
+        distance = _to_nearest(shape, positions) / oversample
         edges = [0.0]
         while edges[-1] <= distance.max():
             edges.append(edges[-1] + max(1.0, WIDTH * edges[-1]))
@@ -46,3 +47,15 @@ class Rings:
     def sums(self, image: Array) -> Array:
         """Return the sum of the pixels in each ring, round all stars."""
         return np.asarray(np.bincount(self.number.ravel(), image.ravel(), len(self)), np.float64)
+
+
+def _to_nearest(shape: tuple[int, int], positions: Array) -> Array:
+    """Return the distance of each pixel from the nearest position."""
+    if len(positions) > FEW:
+        y, x = np.indices(shape)
+        return np.asarray(KDTree(positions).query(np.stack([x, y], axis=-1))[0])
+    rows, columns = np.arange(shape[0])[:, None], np.arange(shape[1])
+    squares = np.full(shape, np.inf)
+    for x, y in positions:
+        np.minimum(squares, (rows - y) ** 2 + (columns - x) ** 2, out=squares)
+    return np.asarray(np.sqrt(squares))

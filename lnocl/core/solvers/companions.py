@@ -242,12 +242,13 @@ def _with_points(
     """
     fitted = list(points)
     n, n_epochs = estimate.scene.n_stars, estimate.scene.n_epochs
-    for k in [*range(len(points))] * N_STEPS:
-        now = holding(estimate, fitted, width)
-        point = _fitted(now, n + k * n_epochs, fitted[k], raised)
-        if point is None:
-            return None
-        fitted[k] = point
+    for is_last in [False] * (N_STEPS - 1) + [True]:
+        for k in range(len(points)):
+            now = holding(estimate, fitted, width)
+            point = _fitted(now, n + k * n_epochs, fitted[k], raised, is_last)
+            if point is None:
+                return None
+            fitted[k] = point
     away = [np.hypot(*(each.place - estimate.scene.stars).T).min() for each in fitted]
     if min(away) * estimate.scene.oversample < NEAREST * width:
         return None
@@ -269,18 +270,19 @@ def holding(estimate: Estimate, points: Sequence[Companion], width: float) -> Es
 
 
 def _fitted(
-    estimate: Estimate, first: int, point: Companion, raised: Array | None
+    estimate: Estimate, first: int, point: Companion, raised: Array | None, is_last: bool
 ) -> Companion | None:
     """Return a point, the star `first`, after a step to where it fits; None where it has no light.
 
-    Its flux is the mean over epochs.
+    Its flux is the mean over epochs. The errors of its place are those of the last step.
     """
     near = NearStar(Surroundings(estimate, True, raised), first, FINISHED)
     change, change_error, step = step_of(near, first, estimate.scene.n_epochs)
     flux, at = point.flux + change * estimate.scene.unit, near.unknowns[0, 1:]
     if flux <= 0 or not np.isfinite(variances(near.fit.information)[at]).all():
         return None
-    errors = np.array([change_error * estimate.scene.unit, *np.sqrt(near.fit.variances(at))])
+    of_place = np.sqrt(near.fit.variances(at)) if is_last else point.errors[1:]
+    errors = np.array([change_error * estimate.scene.unit, *of_place])
     place = point.place + step[at].clip(-MOVED, MOVED)
     return Companion(place, flux, errors, point.significance)
 

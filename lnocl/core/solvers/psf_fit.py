@@ -38,7 +38,7 @@ from lnocl.core.solvers.sources import Sources
 # is smoothed over that.
 CORRELATED, SMOOTHED = 1.5, 4.0
 # Steps of conjugate gradients, and the share of the gradient at which they end.
-N_STEPS, FINISHED = 40, 1e-4
+N_STEPS, FINISHED = 40, 1e-2
 # A step moves no parameter by more of its prior's standard deviations, and no star by more pixels.
 MAX_STEP, MAX_MOVE = 3.0, 0.5
 
