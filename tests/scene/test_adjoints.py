@@ -13,7 +13,7 @@ import turned_scenes
 from scenes import make_psfs, make_smooth_psfs
 
 import lnocl
-from lnocl.core.scene.camera import Camera, sampled
+from lnocl.core.scene.camera import Camera, Windows, sampled
 from lnocl.core.scene.estimate import Estimate
 from lnocl.core.scene.forward_model import Model
 from lnocl.core.scene.psf_families import spectrum
@@ -220,6 +220,22 @@ def test_windows_of_one_camera_that_end_alike():
         seen = range(first, 14), range(first + 3, 17)
         found = camera.window(seen, (rows, columns)).forward(x)
         np.testing.assert_allclose(found, whole[np.ix_(*seen)], rtol=1e-12)
+
+
+@every_kind
+@pytest.mark.parametrize("dark", [[], [1], [0, 1, 2]])
+def test_windows_of_all_images_at_once(kind, dark):
+    """Images of one cut and others, some of them dark."""
+    scene, q = a_scene(kind), a_scene(kind).oversample
+    places = [(range(3, 20), range(8, 19))] * 2 + [(range(5, 20), range(8, 19))]
+    sky = range(2 * q, 22 * q), range(6 * q, 20 * q)
+    maps = [Camera(scene, j).window(seen, sky) for j, seen in enumerate(places)]
+    windows, x = Windows(maps), abs(noise(20 * q, 14 * q))
+    for found, each in zip(windows.forward(x), maps, strict=True):
+        np.testing.assert_allclose(found, each.forward(x), rtol=1e-12, atol=1e-12 * found.max())
+    images = [noise(*each.shape, seed=j) * (j not in dark) for j, each in enumerate(maps)]
+    expected = sum(each.adjoint(y) for each, y in zip(maps, images, strict=True))
+    np.testing.assert_allclose(windows.adjoint(images), expected, rtol=0, atol=1e-13 * q**2 * 10)
 
 
 @every_kind

@@ -8,16 +8,19 @@ r"""Cameras: the maps from the sky's grid to the images, ``A_j = Sample o Turn o
 
 Of each map there are `forward`, `adjoint` and `squares`, the adjoint of the squared elements; and
 `window`, the map between a window of the sky and one of the image. Maps with the same `key` share
-spectra of the sky: `images_of` and `adjoint_of` transform the sky once for all of them.
+spectra of the sky: `images_of` and `Windows` transform the sky once for all of them.
 """
 
 from __future__ import annotations
 
 import math
+from collections import defaultdict
 from collections.abc import Hashable, Iterable, Iterator, Sequence
+from copy import copy
 from functools import cached_property
 from itertools import groupby
 from types import EllipsisType
+from typing import Any
 
 import numpy as np
 import scipy.fft
@@ -78,7 +81,7 @@ class LinearMap:
 
     def seen(self, spectrum: Spectrum) -> Array:
         """Return the image of the sky that has this spectrum."""
-        fine = self._pixels(self._otf * spectrum)[self._seen]
+        fine = self._pixels(self._otf * spectrum)[_each(self._seen)]
         return np.ascontiguousarray(sampled(fine, self._oversample))
 
     def back(self, image: Array) -> Spectrum:
@@ -97,8 +100,8 @@ class LinearMap:
     def _transform(self, values: Array, there: Part) -> Spectrum:
         laid = values
         if there is not ...:
-            laid = np.zeros(self._grid)
-            laid[there] = values
+            laid = np.zeros((*values.shape[:-2], *self._grid))
+            laid[_each(there)] = values
         return np.asarray(scipy.fft.rfft2(laid, workers=threads(self._grid)))
 
     def _pixels(self, spectrum: Spectrum) -> Array:
@@ -294,6 +297,8 @@ class WindowCamera(LinearMap):
         Of the window of the image.
     reached : tuple of range
         The window of the sky, round the edges of the grid.
+    cut : hashable
+        What maps have in common that differ in the PSF alone.
     """
 
     def __init__(self, camera: Camera, seen: Ranges, sky: Ranges | None) -> None:
@@ -309,6 +314,7 @@ class WindowCamera(LinearMap):
         self._otf = camera.part_otf(self._grid, first, origin)
         self._sky = window(0, 0, [len(at) for at in self.reached], self._grid)
         self._seen = window(y, x, [len(at) for at in fine], self._grid)
+        self.cut = self.key, self.shape, y, x
 
 
 class TurnedWindow(LinearMap):
@@ -367,20 +373,55 @@ def images_of(cameras: Iterable[Camera], sky: Array) -> Iterator[Array]:
             yield camera.seen(camera.shared_spectrum(sky, spectra))
 
 
-def seen_by(maps: Iterable[LinearMap], sky: Array) -> Iterator[Array]:
-    """Yield the images that maps have of a sky."""
-    spectra: dict[Hashable, Spectrum] = {}
-    return (each.seen(each.shared_spectrum(sky, spectra)) for each in maps)
+class Windows:
+    """Maps between one window of the sky and one of each image, those of one cut all at once.
 
+    Parameters
+    ----------
+    maps : sequence of p WindowCamera or TurnedWindow
+        All take the same window of the sky.
+    """
 
-def adjoint_of(maps: Iterable[LinearMap], images: Iterable[Array]) -> Array:
-    """Return the sum of the adjoints of maps, each applied to its image."""
-    totals: dict[Hashable, tuple[LinearMap, Spectrum]] = {}
-    for each, image in zip(maps, images, strict=True):
-        if not totals or image.any():  # what a flux of one epoch changes is dark in all others
+    def __init__(self, maps: Sequence[WindowCamera | TurnedWindow]) -> None:
+        self._maps, cuts = maps, defaultdict[Hashable, list[int]](list)
+        for j, each in enumerate(maps):
+            cuts[each.cut if isinstance(each, WindowCamera) else j].append(j)
+        self._cuts = list(cuts.values())
+        self._joint = [_joined([maps[j] for j in members]) for members in self._cuts]
+
+    def forward(self, sky: Array) -> list[Array]:
+        """Return the images of a sky."""
+        images, spectra = [sky] * len(self._maps), dict[Hashable, Spectrum]()
+        for members, each in zip(self._cuts, self._joint, strict=True):
+            seen = each.seen(each.shared_spectrum(sky, spectra))
+            for j, image in zip(members, seen if len(members) > 1 else [seen], strict=True):
+                images[j] = image
+        return images
+
+    def adjoint(self, images: Sequence[Array]) -> Array:
+        """Return the sum of the adjoints, each applied to its image."""
+        totals: dict[Hashable, tuple[LinearMap, Spectrum]] = {}
+        for members, each in zip(self._cuts, self._joint, strict=True):
+            # What a flux of one epoch changes is dark in all others.
+            lit = [j for j in members if images[j].any()]
+            if len(lit) == len(members) > 1:
+                back = each.back(np.array([images[j] for j in lit])).sum(axis=0)
+            elif lit or not totals:
+                back = sum(self._maps[j].back(images[j]) for j in lit or members[:1])
+            else:
+                continue
             _, so_far = totals.get(each.key, (each, 0.0))
-            totals[each.key] = each, each.back(image) + so_far
-    return np.asarray(sum(each.sky(total) for each, total in totals.values()))
+            totals[each.key] = each, back + so_far
+        return np.asarray(sum(each.sky(total) for each, total in totals.values()))
+
+
+def _joined(maps: Sequence[WindowCamera | TurnedWindow]) -> WindowCamera | TurnedWindow:
+    """Return maps of one cut as one, whose images are stacked."""
+    if len(maps) == 1:
+        return maps[0]
+    joint = copy(maps[0])
+    joint._otf = np.array([each._otf for each in maps])
+    return joint
 
 
 def adjoints_of(cameras: Sequence[Camera], images: Iterable[Array], factors: Array) -> Array:
@@ -445,9 +486,14 @@ def spread(image: Array, oversample: int, beside: float = 0.0) -> Array:
     """Return the adjoint of `sampled`: the pixels of an image on the sky's, 0 between them."""
     if oversample == 1:
         return image
-    sky = np.full([oversample * n for n in image.shape], beside)
-    sky[::oversample, ::oversample] = image
+    sky = np.full((*image.shape[:-2], *(oversample * n for n in image.shape[-2:])), beside)
+    sky[..., ::oversample, ::oversample] = image
     return sky
+
+
+def _each(part: Part) -> Any:
+    """Return where a part of each of several arrays lies."""
+    return part if isinstance(part, EllipsisType) else (..., *part)
 
 
 def ranges(first: Sequence[int], shape: Sequence[int]) -> Ranges:

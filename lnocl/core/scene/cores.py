@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lnocl.core.scene.arrays import Array
+from lnocl.core.scene.remembered import remembered
 
 # A core is what is connected to the peak and above this share of it.
 CORE = 0.3
@@ -63,6 +64,7 @@ def off_centre(psf: Array) -> tuple[float, float]:
     return column - x, row - y
 
 
+@remembered(2**17)  # all fits of a run ask for the same few
 def fwhm(light: Array) -> float:
     """Return the full width of a core at half its maximum, pixels: of a disc of the same area."""
     from scipy.ndimage import zoom

@@ -105,14 +105,21 @@ class DetectorPsf:
         self._half = (oversample - 1) / 2.0
         self._lag = self._half if is_effective else 0.0
 
-    def changed(self, function: Callable[[Array], Iterable[Array]]) -> list[DetectorPsf]:
+    @property
+    def contents(self) -> tuple[object, ...]:
+        """What tells it from others."""
+        return self.fine, self._q, self._is_effective
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes, as of `fine`."""
+        return self.fine.nbytes
+
+    def changed(self, function: Callable[[Array], Array]) -> DetectorPsf:
         """Return what a function makes of the PSF, seen by the same pixels."""
-        others = []
-        for fine in self.fine.changed(function):
-            other = copy(self)
-            other.fine = fine
-            others.append(other)
-        return others
+        other = copy(self)
+        other.fine = self.fine.changed(function)
+        return other
 
     def response(self, x: float, y: float) -> Cutout:
         """Return h on the fine grid, the sky moved by so many pixels of the image."""

@@ -14,7 +14,7 @@ from lnocl.core.scene.camera import (
     Camera,
     Ranges,
     Spectrum,
-    adjoint_of,
+    Windows,
     adjoints_of,
     images_of,
     is_flat,
@@ -132,7 +132,7 @@ class Model:
             least = RINGING if self.scene.rotations else ROUNDING
             return Cutout(total, 0, 0).trimmed(least * float(abs(total).max()))
         windows = [self.cameras[j].window(each, (rows, columns)) for j, each in seen.items()]
-        total = adjoint_of(windows, [cutouts[j].values for j in seen])
+        total = Windows(windows).adjoint([cutouts[j].values for j in seen])
         cutout = Cutout(total, rows.start, columns.start)
         return cutout.trimmed(ROUNDING * float(abs(total).max()))
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -11,6 +10,7 @@ from scipy.ndimage import binary_opening, label
 from scipy.special import log_ndtr
 
 from lnocl.core.scene.arrays import Array, Mask
+from lnocl.core.scene.remembered import remembered
 
 # Rings begin at this share of the way to the nearest edge: the light beyond is told from rings far
 # out, its slope from rings that lie apart. So many rings at most, a pixel wide at least.
@@ -100,6 +100,7 @@ class PsfEdge(NamedTuple):
         return wing
 
 
+@remembered(2**24)  # all fits of a run ask for the same few
 def psf_edge(psf: Array) -> PsfEdge:
     r"""Return what the outer rings of a PSF tell of the light beyond its file, and of a level.
 
@@ -138,14 +139,7 @@ def psf_edge(psf: Array) -> PsfEdge:
     0.58 %, 0.00 %
     """
     psf = psf / psf.sum()
-    return _edge_of(np.asarray(psf, float).tobytes(), psf.shape)
-
-
-@lru_cache(maxsize=16)  # all fits of a run ask for the same few
-def _edge_of(content: bytes, shape: tuple[int, int]) -> PsfEdge:
-    psf = np.frombuffer(content).reshape(shape)
     known, r = _known(psf), _radii(psf.shape)
-    known.flags.writeable = False
     radius, furthest = _reach(known), float(r[known].max())
     if radius < LEAST_RADIUS:
         return PsfEdge(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, LEAST_EXPONENT, 0.0, radius, known)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -21,6 +21,9 @@ MIN_NYQUIST = 1e-16
 
 # A grid that no PSF goes round.
 ENDLESS = 2**31, 2**31
+
+# Rows and columns of PSFs.
+AXES = -2, -1
 
 # Rows and columns of an array: slices, or arrays of indices where they wrap round its edge.
 Window = tuple[Any, Any]
@@ -126,8 +129,8 @@ class MovablePsf:
 
     Parameters
     ----------
-    psf : ndarray of float64, shape (ky, kx)
-        Of any size; where it is larger than the grid it is wrapped round.
+    psf : ndarray of float64, shape (ky, kx) or (k, ky, kx)
+        Of any size; where it is larger than the grid it is wrapped round. Several are placed alike.
     grid : tuple of int
         Shape (Ny, Nx).
     """
@@ -135,22 +138,32 @@ class MovablePsf:
     def __init__(self, psf: Array, grid: tuple[int, int]) -> None:
         self._psf, self._grid = psf, grid
 
+    @property
+    def contents(self) -> tuple[object, ...]:
+        """What tells it from others."""
+        return self._psf, self._grid
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes, of its spectrum in margins too."""
+        return 4 * self._psf.nbytes
+
     def at(self, x: float, y: float, axis: int | None = None) -> Cutout:
         """Return the PSF at a position, or a derivative, as `place` does."""
         whole = int(np.floor(y + 0.5)), int(np.floor(x + 0.5))
         fraction = y - whole[0], x - whole[1]
         is_moved = any(fraction) or axis is not None
         values = self._spectrum.moved(fraction, axis) if is_moved else self._folded
-        return Cutout(values, *(i - n // 2 for i, n in zip(whole, values.shape, strict=True)))
+        return Cutout(values, *(i - n // 2 for i, n in zip(whole, values.shape[-2:], strict=True)))
 
     @property
     def fine(self) -> MovablePsf:
         """The PSF on the pixels of the sky."""
         return self
 
-    def changed(self, function: Callable[[Array], Iterable[Array]]) -> list[MovablePsf]:
+    def changed(self, function: Callable[[Array], Array]) -> MovablePsf:
         """Return what a function makes of the PSF, to be placed alike."""
-        return [MovablePsf(psf, self._grid) for psf in function(self._psf)]
+        return MovablePsf(function(self._psf), self._grid)
 
     def on_sky(self, x: float, y: float) -> Cutout:
         """Return the PSF at a position."""
@@ -170,7 +183,7 @@ class MovablePsf:
     @cached_property
     def _folded(self) -> Array:
         psf = self._psf
-        for i, n in enumerate(self._grid):
+        for i, n in zip(AXES, self._grid, strict=True):
             if psf.shape[i] > n:
                 psf = fold(psf, n, i)
         return psf
@@ -178,9 +191,9 @@ class MovablePsf:
     @cached_property
     def _spectrum(self) -> _Spectrum:
         psf = self._psf
-        for i, n in enumerate(self._grid):
+        for i, n in zip(AXES, self._grid, strict=True):
             psf = _widen(psf, n, i)
-        variances = _variance(self._psf.sum(axis=1)), _variance(self._psf.sum(axis=0))
+        variances = _variance(self._psf.sum(axis=-1)), _variance(self._psf.sum(axis=-2))
         return _Spectrum(psf, variances)
 
 
@@ -233,32 +246,32 @@ def place(psf: Array, grid: tuple[int, int], x: float, y: float, axis: int | Non
     return MovablePsf(psf, grid).at(x, y, axis)
 
 
-def _variance(profile: Array) -> float:
+def _variance(profile: Array) -> Array:
     """Return the sigma^2 of the Gaussian, integrated over pixels, with as much at 1 / 2 per pixel.
 
     It and its alias -1 / 2 have ``2 sinc(1 / 2) exp(-pi^2 sigma^2 / 2)`` together, of unit light.
     """
-    signs = 1 - 2 * (np.arange(len(profile)) % 2)
-    light = float(profile.sum())
-    share = abs(float(signs @ profile)) / light if light else 1.0
-    return 2.0 / np.pi**2 * float(np.log(4.0 / np.pi / np.clip(share, MIN_NYQUIST, 1.0)))
+    signs = 1 - 2 * (np.arange(profile.shape[-1]) % 2)
+    light = profile.sum(axis=-1)
+    share = np.divide(abs(profile @ signs), light, out=np.ones_like(light), where=light != 0)
+    return np.asarray(2.0 / np.pi**2 * np.log(4.0 / np.pi / share.clip(MIN_NYQUIST, 1.0)))
 
 
 class _Spectrum:
     """The spectrum of a PSF in its margins, and how its frequencies move along each axis."""
 
-    def __init__(self, psf: Array, variances: tuple[float, float]) -> None:
+    def __init__(self, psf: Array, variances: tuple[Array, Array]) -> None:
         # Imported here: it takes a twentieth of a second, which stars on whole pixels need not.
         import scipy.fft
 
-        self._shape, self._inverse = psf.shape, scipy.fft.irfft2
+        self._shape, self._inverse = psf.shape[-2:], scipy.fft.irfft2
         self._values = scipy.fft.rfft2(psf)
-        self._phases = [_Phases(n, each) for n, each in zip(psf.shape, variances, strict=True)]
+        self._phases = [_Phases(n, each) for n, each in zip(self._shape, variances, strict=True)]
 
     def moved(self, fraction: tuple[float, float], axis: int | None) -> Array:
         """Return the PSF moved by fractions of a pixel (dy, dx), or a derivative of that."""
         y, x = (p.at(fraction[i], i == axis) for i, p in enumerate(self._phases))
-        moved: Array = self._inverse(self._values * y[:, None] * _half(x), self._shape)
+        moved: Array = self._inverse(self._values * y[..., None] * _half(x), self._shape)
         return moved
 
     def with_slopes(self, fraction: tuple[float, float]) -> Array:
@@ -266,14 +279,14 @@ class _Spectrum:
         y, x = (p.at(fraction[i], False) for i, p in enumerate(self._phases))
         slope_y, slope_x = (p.at(fraction[i], True) for i, p in enumerate(self._phases))
         along = np.array([y, y, slope_y])[:, :, None]
-        across = np.array([_half(x), _half(slope_x), _half(x)])[:, None, :]
+        across = np.array([_half(x), _half(slope_x), _half(x)])
         values: Array = self._inverse(self._values * along * across, self._shape)
         return values
 
 
 def _half(phases: NDArray[np.complex128]) -> NDArray[np.complex128]:
     """Return the factors of the frequencies that a real transform holds."""
-    return phases[: len(phases) // 2 + 1]
+    return phases[..., None, : phases.shape[-1] // 2 + 1]
 
 
 class _Phases:
@@ -283,11 +296,12 @@ class _Phases:
     a mirrored PSF moves as its mirror image does.
     """
 
-    def __init__(self, n: int, variance: float) -> None:
+    def __init__(self, n: int, variance: Array) -> None:
         self._own = np.fft.fftfreq(n)
         frequencies = self._own[:, None] + ALIASES
-        shares = np.sinc(frequencies) * np.exp(-2.0 * variance * (np.pi * frequencies) ** 2)
-        self._shares = shares / shares.sum(axis=1, keepdims=True)
+        squares = (np.pi * frequencies) ** 2
+        shares = np.sinc(frequencies) * np.exp(-2.0 * variance[..., None, None] * squares)
+        self._shares = shares / shares.sum(axis=-1, keepdims=True)
         self._slopes = self._shares * (-2j * np.pi * frequencies)
 
     def at(self, fraction: float, derivative: bool) -> NDArray[np.complex128]:
@@ -303,17 +317,18 @@ def fold(psf: Array, n: int, axis: int) -> Array:
     k = psf.shape[axis]
     before = (n // 2 - k // 2) % n
     wide = -(-(k + before) // n) * n
-    padding = [(0, 0), (0, 0)]
+    padding = [(0, 0)] * psf.ndim
     padding[axis] = before, wide - k - before
     padded = np.pad(psf, padding)
-    shape = (*padded.shape[:axis], wide // n, n, *padded.shape[axis + 1 :])
-    return padded.reshape(shape).sum(axis)
+    at = axis % psf.ndim
+    shape = (*padded.shape[:at], wide // n, n, *padded.shape[at + 1 :])
+    return padded.reshape(shape).sum(at)
 
 
 def _widen(psf: Array, n: int, axis: int) -> Array:
     """Return a PSF with margins along an axis, or round the whole axis where they do not fit."""
     if psf.shape[axis] + 2 * MARGIN >= n:
         return fold(psf, n, axis)
-    padding = [(0, 0), (0, 0)]
+    padding = [(0, 0)] * psf.ndim
     padding[axis] = MARGIN, MARGIN
     return np.pad(psf, padding)

@@ -28,7 +28,7 @@ class SmoothField:
         self._root = root / np.sqrt(np.fft.irfft2(root**2, shape)[0, 0])
 
     def apply(self, x: Array) -> Array:
-        """Return the field of x, shape (ny, nx)."""
+        """Return the fields of x, shape (..., ny, nx)."""
         from scipy import fft  # which the start of a command need not load
 
         spectrum = self._root * fft.rfft2(x, workers=self._threads)

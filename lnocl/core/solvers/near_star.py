@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
 from lnocl.core.scene.arrays import Array
-from lnocl.core.scene.camera import Camera, adjoint_of, seen_by
+from lnocl.core.scene.camera import Camera, Windows
 from lnocl.core.scene.detector import on_sky
 from lnocl.core.scene.estimate import Estimate
 from lnocl.core.scene.hosts import light_of_host
@@ -39,7 +39,7 @@ from lnocl.core.solvers.least_squares import (
     LinearImage,
     SourceError,
 )
-from lnocl.core.solvers.psf_errors import VARIANCE, Made, PsfErrors
+from lnocl.core.solvers.psf_errors import VARIANCE, PsfErrors
 from lnocl.core.solvers.sources import Sources
 
 # Side of the window round a star, and how far off other stars may be that are not taken as known,
@@ -80,8 +80,6 @@ class Surroundings:
         Radii round stars that are shown in which no image has observed a pixel, pixels of the sky.
     n_shapes : int
         Halos of each image that are unknown.
-    made : dict
-        What was made of PSFs (`lnocl.core.solvers.psf_errors`).
     """
 
     def __init__(
@@ -93,7 +91,6 @@ class Surroundings:
     ) -> None:
         self.estimate, self.moves, self.holds_shapes = estimate, moves, holds_shapes
         self.scene = scene = estimate.scene
-        self.made: Made = {}
         self.width = resolution(scene)
         self.hidden = hidden_radii(scene, self.width)
         self.cameras = [Camera(scene, j) for j in range(scene.n_images)]
@@ -180,7 +177,7 @@ class NearStar:
         self.psfs, self._cusps = None, list[float]()
         is_free = not around.holds_shapes
         if observation.psf_error or (len(observation.psf_scatter) and is_free):
-            self.psfs = PsfErrors(around.estimate, self._views, around.made)
+            self.psfs = PsfErrors(around.estimate, self._views)
         if observation.psf_error:
             self._cusps = [self._cusp(around, s) for s in self.held]
         self.images = [
@@ -252,18 +249,18 @@ class NearStar:
     def _source_error(self, around: Surroundings, amplitude: Array, width: float) -> SourceError:
         """Return the error of the extended source in the window, and its change there."""
         shape, sky = self.window.shape, self.window.finer(around.scene.oversample).ranges
-        windows = [
+        maps = [
             camera.window(view.window.ranges, sky)
             for camera, view in zip(around.cameras, self._views, strict=True)
         ]
+        windows = Windows(maps)
 
         def forward(sky: Array) -> Array:
-            return np.array([enlarged(each, shape) for each in seen_by(windows, sky)])
+            return np.array([enlarged(each, shape) for each in windows.forward(sky)])
 
         def adjoint(images: Iterable[Array]) -> Array:
-            pairs = zip(windows, images, strict=True)
-            held = (image[: each.shape[0], : each.shape[1]] for each, image in pairs)
-            return adjoint_of(windows, held)
+            pairs = zip(maps, images, strict=True)
+            return windows.adjoint([image[: m.shape[0], : m.shape[1]] for m, image in pairs])
 
         return SourceError(forward, adjoint, amplitude, width)
 

@@ -17,9 +17,8 @@ Light outside the stars is taken through the PSF as it is.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any
 
 import numpy as np
 import scipy.fft
@@ -28,10 +27,13 @@ from scipy.ndimage import gaussian_filter
 
 from lnocl.core.scene.arrays import Array
 from lnocl.core.scene.cores import fwhm
+from lnocl.core.scene.detector import DetectorPsf
 from lnocl.core.scene.estimate import Estimate
 from lnocl.core.scene.observation import Observation
 from lnocl.core.scene.psf_edge import psf_edge
 from lnocl.core.scene.psf_field import mapped
+from lnocl.core.scene.remembered import remembered
+from lnocl.core.scene.shifting import Cutout, MovablePsf
 from lnocl.core.scene.smooth_field import SmoothField
 from lnocl.core.scene.transforms import enlarged
 from lnocl.core.scene.view import View
@@ -47,8 +49,7 @@ PIXELS, ZERO_POINTS, SHIFT, WINGS = 0.67, 0.67, 0.5, 0.3
 CORRELATED, SMOOTHED = 0.6, 2.0
 # The variance of a Gaussian of unit full width at half maximum.
 VARIANCE = 1.0 / (8.0 * np.log(2.0))
-# By the PSF, which is of one image, the shape of the window, and what is made.
-Made = dict[tuple[int, tuple[int, int], str], Sequence[Any]]
+Movable = MovablePsf | DetectorPsf
 # Pixels beside a PSF in which the derivatives of its edges ring.
 MARGIN = 8
 # The correlation of theta of two PSFs: those of a library err together, those of a frame alone.
@@ -153,8 +154,6 @@ class PsfErrors:
         What is modelled, and how bright it is.
     views : sequence of p View
         The images in the window.
-    made : dict
-        PSFs that were made of those of the scene, for other windows too.
 
     Attributes
     ----------
@@ -164,8 +163,8 @@ class PsfErrors:
         The inverse of their covariance.
     """
 
-    def __init__(self, estimate: Estimate, views: Sequence[View], made: Made) -> None:
-        self._estimate, self._views, self._made = estimate, views, made
+    def __init__(self, estimate: Estimate, views: Sequence[View]) -> None:
+        self._estimate, self._views = estimate, views
         observation = estimate.scene.observation
         self._error, self._numbers = observation.psf_error, alike(observation)
         n, epochs = N_SLOPES * count(observation), observation.epochs
@@ -183,8 +182,7 @@ class PsfErrors:
     def slopes(self, j: int, model: Array) -> tuple[list[Array], NDArray[np.int_]]:
         """Return the derivatives of the model of an image in its window, and by which unknowns."""
         # A PSF and one that is changed are moved alike by fractions of a pixel.
-        own, *changed = self._of_stars(j, "slopes", partial(self._changed_near, j), N_SLOPES + 1)
-        slopes = [each - own for each in changed]
+        slopes = list(self._of_stars(j, self._slopes_at, N_SLOPES))
         unknowns = N_SLOPES * self._numbers[j] + np.arange(N_SLOPES)
         if self._is_one_of_several[j]:
             sources = model - self._views[j].background
@@ -197,50 +195,88 @@ class PsfErrors:
         scatter = self._estimate.scene.observation.psf_scatter
         light, deviations = np.zeros((2, len(self._views), *shape))
         for j in range(len(self._views)):
-            [own] = self._of_stars(j, "own", lambda psf: psf[None])
+            own = self._of_stars(j, lambda _, psf, at: psf.at(*at))
             deviation = PIXELS * self._error * gaussian_filter(own, SMOOTHED)
             if len(scatter):
-                [given] = self._of_stars(j, "scatter", partial(_instead, scatter[j]))
+                given = self._of_stars(j, self._scatter_at)
                 deviation = np.maximum(deviation, given)
             light[j], deviations[j] = (enlarged(each, shape) for each in (own, deviation))
         return PixelErrors(light, deviations, self._numbers)
 
-    def _changed_near(self, j: int, psf: Array) -> Array:
-        """Return the part of a PSF that a star in the window may light, and it with each slope.
-
-        Light beyond the file, which counts where images are larger, has the standard deviation that
-        the edge of the PSF tells. A level of all pixels has that of its border, which it is part
-        of. It holds at most `psf_error` of the light, as a halo of the PSF may be as level.
-        """
+    def _slopes_at(self, j: int, psf: Movable, at: Array) -> Cutout:
+        """Return the derivatives of a star's image by what its PSF may have wrong."""
         scene, (ny, nx) = self._estimate.scene, self._views[j].window.shape
+        height, width = scene.observation.shape
+        images = scene.oversample * height, scene.oversample * width
         most = 2 * scene.oversample * ny, 2 * scene.oversample * nx
-        shape = min(psf.shape[0], most[0]), min(psf.shape[1], most[1])
-        near = enlarged(psf, shape, is_centred=True)
-        slopes = [enlarged(each, most, is_centred=True) for each in slopes_of(near, self._error)]
-        own, (beyond, level) = enlarged(psf, most, is_centred=True), np.zeros((2, *most))
-        light, images = float(psf.sum()), scene.oversample * np.array(scene.observation.shape)
-        if light > 0:
-            flat = enlarged(np.ones(psf.shape), most, is_centred=True)
-            height = min(_on_border(psf), self._error * light / psf.size)
-            level = height * (flat - psf.size / light * own)
-            if (psf.shape < images).any():
-                edge = psf_edge(psf / light)
-                beyond = light * edge.wing(most) - edge.light * own
-        return own + np.array([np.zeros(most), *slopes, beyond, level])
+        return _slopes_at(psf, self._error, most, images, *at.tolist())
 
-    def _of_stars(self, j: int, name: str, make: Callable[[Array], Array], n: int = 1) -> Array:
-        """Return what the stars in a window show through n arrays that are made of their PSFs."""
+    def _scatter_at(self, j: int, psf: Movable, at: Array) -> Cutout:
+        scatter = self._estimate.scene.observation.psf_scatter[j]
+        return psf.changed(partial(_instead, scatter)).at(*at)
+
+    def _of_stars(
+        self, j: int, seen_at: Callable[[int, Movable, Array], Cutout], *several: int
+    ) -> Array:
+        """Return what the stars in a window show, by what each of unit flux does at its place."""
         scene, view, field = self._estimate.scene, self._views[j], self._estimate.scene.star_field
-        seen = np.zeros((n, *view.window.shape))
+        seen = np.zeros((*several, *view.window.shape))
         for s in field.reaching(j, view.window[:2], view.window.shape):
             if s < scene.n_stars:  # else it is a halo
-                psf = field.psfs[j][s]
-                key = id(psf), view.window.shape, name
-                if key not in self._made:
-                    self._made[key] = psf.changed(make)
-                for image, each in zip(seen, self._made[key], strict=True):
-                    image += self._estimate.fluxes[s] * view.cut(each.at(*field.places[j][s]))
+                cutout = seen_at(j, field.psfs[j][s], field.places[j][s])
+                seen += self._estimate.fluxes[s] * view.cut(cutout)
         return seen
+
+
+@remembered(2**26)  # all fits of a run ask for the same few
+def _slopes_at(
+    psf: Movable, error: float, most: tuple[int, int], images: tuple[int, int], x: float, y: float
+) -> Cutout:
+    """Return the derivatives of the image of a star at (x, y), (N_SLOPES, h, w)."""
+    # A PSF and one that is changed are moved alike by fractions of a pixel.
+    seen = _with_slopes(psf, error, most, images).at(x, y)
+    return seen._replace(values=seen.values[1:] - seen.values[0])
+
+
+@remembered(2**26)  # as those of all stars
+def _with_slopes(
+    psf: Movable, error: float, most: tuple[int, int], images: tuple[int, int]
+) -> Movable:
+    """Return a PSF, and it with each slope, to be placed alike."""
+    return psf.changed(partial(_changed, error=error, most=most, images=images))
+
+
+def _changed(psf: Array, error: float, most: tuple[int, int], images: tuple[int, int]) -> Array:
+    """Return a PSF in an array of a shape, and it with each slope, (N_SLOPES + 1, height, width).
+
+    Light beyond the file, which counts where images are larger, has the standard deviation that the
+    edge of the PSF tells. A level of all pixels has that of its border, which it is part of. It
+    holds at most `psf_error` of the light, as a halo of the PSF may be as level.
+
+    Parameters
+    ----------
+    psf : ndarray of float64, shape (ky, kx)
+        Of whatever light.
+    error : float
+        Standard deviation of the relative width.
+    most : tuple of int
+        The shape, of what a star in a window may light.
+    images : tuple of int
+        The shape of the images, in the pixels of the PSF.
+    """
+    shape = min(psf.shape[0], most[0]), min(psf.shape[1], most[1])
+    near = enlarged(psf, shape, is_centred=True)
+    slopes = [enlarged(each, most, is_centred=True) for each in slopes_of(near, error)]
+    own, (beyond, level) = enlarged(psf, most, is_centred=True), np.zeros((2, *most))
+    light = float(psf.sum())
+    if light > 0:
+        flat = enlarged(np.ones(psf.shape), most, is_centred=True)
+        height = min(_on_border(psf), error * light / psf.size)
+        level = height * (flat - psf.size / light * own)
+        if (psf.shape < np.array(images)).any():
+            edge = psf_edge(psf / light)
+            beyond = light * edge.wing(most) - edge.light * own
+    return own + np.array([np.zeros(most), *slopes, beyond, level])
 
 
 def _on_border(psf: Array) -> float:
@@ -250,7 +286,7 @@ def _on_border(psf: Array) -> float:
 
 def _instead(scatter: Array, psf: Array) -> Array:
     """Return the scatter of a PSF, as bright as that."""
-    return (psf.sum() * scatter)[None]
+    return psf.sum() * scatter
 
 
 class PixelErrors:
@@ -283,17 +319,14 @@ class PixelErrors:
         self._smooth = SmoothField(light.shape[1:], CORRELATED)
         self.at = np.zeros((int(numbers.max()) + 1, *light.shape[1:]))
 
-    def forward(self, x: Array) -> Iterator[Array]:
-        """Yield the changes of the images, shape (height, width)."""
-        fields = [self._smooth.apply(each) for each in x]
-        for shares, scatter, k in zip(self._shares, self.scatter, self._numbers, strict=True):
-            change = scatter * fields[k]
-            yield change - shares * change.sum()
+    def forward(self, x: Array) -> Array:
+        """Return the changes of the images, shape (p, height, width)."""
+        changes = self.scatter * self._smooth.apply(x)[self._numbers]
+        return changes - self._shares * changes.sum(axis=(1, 2), keepdims=True)
 
     def adjoint(self, images: Sequence[Array]) -> Array:
         """Return the transpose of `forward` applied to images, shape (n_psfs, height, width)."""
-        back = np.zeros_like(self.at)
-        parts = zip(self._shares, self.scatter, self._numbers, images, strict=True)
-        for shares, scatter, k, image in parts:
-            back[k] += scatter * (image - np.sum(shares * image))
-        return np.array([self._smooth.apply(each) for each in back])
+        back, seen = np.zeros_like(self.at), np.asarray(images)
+        lost = (self._shares * seen).sum(axis=(1, 2), keepdims=True)
+        np.add.at(back, self._numbers, self.scatter * (seen - lost))
+        return self._smooth.apply(back)
