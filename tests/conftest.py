@@ -16,7 +16,6 @@ os.environ.setdefault(
 # Before NumPy is imported: the test processes are as many as the processors.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
-from lnocl.core.scene.fields import PSF_ERROR
 from lnocl.core.scene.observation import Observation
 from lnocl.io.calibration import Calibration
 
@@ -56,7 +55,7 @@ def pytest_runtest_setup(item):
 @pytest.hookimpl(trylast=True)
 def pytest_runtest_teardown(item):
     """Give back the default, which examples have: these hooks are of tests alone."""
-    _take_psf_error(PSF_ERROR)
+    _take_psf_error(None)
 
 
 @pytest.fixture(scope="module")

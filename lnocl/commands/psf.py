@@ -326,6 +326,7 @@ def _result_cards(stars: Sequence[StarPsf]) -> list[Card]:
         ("CENTREX", first.centre[0], "star's centre in the frame, x, 0-based"),
         ("CENTREY", first.centre[1], "star's centre in the frame, y, 0-based"),
         ("NSTARS", len(first.centres), "stars that the PSF is made of"),
+        ("PSFERROR", first.error, "standard error of the width of the PSF over it"),
         ("NBAD", int(first.bad.sum()), "bad pixels of the frame"),
         *(
             (f"FLUX{j}", star.flux, "set to 1, unit of the frame")

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Literal, NamedTuple
 
-from lnocl.core.scene.fields import PSF_ERROR
 from lnocl.core.scene.observation import PsfCentre
 
 Word = str | float
@@ -105,7 +104,7 @@ class Calibration(NamedTuple):
     oversample: int = 1
     effective_psfs: bool = False
     psf_centre: PsfCentre = "check"
-    psf_error: float = PSF_ERROR
+    psf_error: float | None = None
     psf_errors: Sequence[str] = ()
     halos: Sequence[str] = ()
     star_psfs: Sequence[str] = ()

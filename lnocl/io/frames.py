@@ -11,7 +11,7 @@ from astropy.io import fits
 from lnocl.core.scene import units
 from lnocl.core.scene.arrays import Array, Mask
 from lnocl.core.scene.observation import Observation
-from lnocl.core.scene.psfs import check_psfs
+from lnocl.core.scene.psfs import PSF_ERROR, check_psfs
 from lnocl.core.scene.transforms import enlarged
 from lnocl.errors import InputError, counted, note, warn
 from lnocl.io.calibration import Calibration, Word
@@ -29,6 +29,8 @@ from lnocl.io.psf_grids import is_grid, read_grid
 FLAT = "flat"
 # The extension beside a PSF with the standard deviation of its pixels.
 SCATTER = "SCATTER"
+# The keyword of a PSF with the standard error of its width, relative to that.
+WIDTH_ERROR = "PSFERROR"
 # Of images with more negative pixels than this share the sky was subtracted.
 SUBTRACTED = 0.01
 
@@ -145,7 +147,7 @@ class _Reader:
             oversample=self._calibration.oversample,
             effective_psfs=self._calibration.effective_psfs,
             psf_centre=self._calibration.psf_centre,
-            psf_error=self._calibration.psf_error,
+            psf_error=self._psf_error(),
             **self._psf_errors(),
             **self._star_psfs(),
             halos=self._halos(),
@@ -168,6 +170,15 @@ class _Reader:
             [np.ones(shape) if word == FLAT else self._maps.read("halos", [word]) for word in words]
         )
 
+    def _psf_error(self) -> float:
+        """Return the error that was given, or the largest that files of PSFs have."""
+        if self._calibration.psf_error is not None:
+            return self._calibration.psf_error
+        found = [header.get(WIDTH_ERROR) for header in self._psfs.headers]
+        if any(error is not None for error in found):
+            note(f"{WIDTH_ERROR}, the error of the width of PSFs, is taken from files of PSFs")
+        return max(PSF_ERROR if error is None else float(error) for error in found)
+
     def _psf_errors(self) -> dict[str, Any]:
         """Return the ideal PSFs, pupils, modes and scatter that were given."""
         files: dict[str, list[str]] = {}
@@ -182,7 +193,7 @@ class _Reader:
             parts = [read_extension(path, kind.upper()) for path in paths]
             held = [np.atleast_3d(part.T).T for part in parts if part is not None]
             found[PSF_ERRORS[kind]] = np.concatenate(held) if held else stack.data
-        if "scatter" not in files and self._calibration.psf_error and not self._grids:
+        if "scatter" not in files and self._calibration.psf_error != 0 and not self._grids:
             found["psf_scatter"] = self._scatter_beside()
         return found
 

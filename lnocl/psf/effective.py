@@ -11,13 +11,14 @@ from scipy.ndimage import binary_dilation, maximum_filter, shift
 from scipy.spatial import KDTree
 
 from lnocl.core.scene.arrays import Array, Mask
+from lnocl.core.scene.psfs import PSF_ERROR
 from lnocl.core.scene.shifting import MovablePsf
 from lnocl.detection.fitting import step
 from lnocl.detection.maxima import SIGNIFICANT
 from lnocl.errors import InputError, counted
 from lnocl.psf.centring import Point, brightest
 from lnocl.psf.repair import repair
-from lnocl.psf.scatter import of_one, of_several
+from lnocl.psf.scatter import of_one, of_several, width_error
 from lnocl.psf.steps import cut_square, measure_background, nearest_pixel
 
 # Rounds of fitting the stars and adding what is left of them to the PSF.
@@ -62,6 +63,8 @@ class EffectivePsf(NamedTuple):
         Of unit sum and odd side.
     scatter : ndarray of float64, shape (k, k)
         Standard deviation of what a star shows from it (`lnocl.psf.scatter`).
+    error : float
+        That of the width of a star, relative to the PSF's.
     stars : list of FittedStar
         The stars.
     n_neighbours : int
@@ -70,6 +73,7 @@ class EffectivePsf(NamedTuple):
 
     psf: Array
     scatter: Array
+    error: float
     stars: list[FittedStar]
     n_neighbours: int
 
@@ -158,7 +162,7 @@ def lines(found: EffectivePsf) -> tuple[str, ...]:
         ),
         f"effective PSF: {counted(n, 'star')}, {found.n_neighbours} pixels of neighbours left out "
         f"within {side} x {side} pixels; its pixels have errors of {100 * error:.2f} % of the peak "
-        "in the core (rms, by noise and how stars differ)",
+        f"in the core (rms, by noise and how stars differ), its width {100 * found.error:.2g} %",
     )
 
 
@@ -216,19 +220,19 @@ class _Stars:
     def _finished(self, psf: Array, shown: Array) -> EffectivePsf:
         left, _ = self._residual(psf)
         apart = np.array([self._centred(left, s) / c for s, c in enumerate(self._fluxes)])
+        core, error = psf > CORE * psf.max(), PSF_ERROR
         if len(self._fluxes) > 1:
             scatter = of_several(apart, shown, self._fluxes, psf, self._frame, self._bad)
+            error = width_error(apart, shown, self._fluxes, psf, core)
         else:
             (pixel,), (flux,) = self._pixels, self._fluxes
             scatter = of_one(self._repaired, ~self._good, pixel, self._half) / flux
-        total = psf.sum()
-        core = psf > CORE * psf.max()
-        stars = []
+        total, stars = psf.sum(), []
         for s, (y, x) in enumerate(self._places - self._half):
             parts = apart[s][core & (shown[s] > 0)]
             misfit = float(np.sqrt(np.mean(parts**2)) / psf.max()) if parts.size else np.nan
             stars.append(FittedStar(float(x), float(y), float(self._fluxes[s] * total), misfit))
-        return EffectivePsf(psf / total, scatter / total, stars, self._n_neighbours)
+        return EffectivePsf(psf / total, scatter / total, error, stars, self._n_neighbours)
 
     def _shown(self) -> Array:
         """Return where each star's own pixels show it, neither bad nor a neighbour's: (n, k, k)."""

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from lnocl.core.scene.arrays import Array, Mask, flag
+from lnocl.core.scene.psfs import PSF_ERROR
 from lnocl.core.scene.quantities import in_unit, split
 from lnocl.core.scene.shifting import MARGIN
 from lnocl.detection.checks import read_image
@@ -33,6 +34,9 @@ class StarPsf:
     scatter : ndarray of float64, shape (k, k)
         Standard deviation of its pixels: noise, and how stars differ where there are several
         (`lnocl.psf.scatter`). `lnocl.Observation` takes it with the PSF.
+    error : float
+        Standard error of its width, relative to that: 0.03 by one star, less where several are
+        alike (`lnocl.psf.scatter.width_error`). It is the `psf_error` of an observation.
     shared_steps : tuple of str
         One line for each step that PSFs at all angles share, in order, with its numbers.
     own_steps : tuple of str
@@ -67,6 +71,7 @@ class StarPsf:
 
     psf: Array
     scatter: Array
+    error: float
     shared_steps: tuple[str, ...]
     own_steps: tuple[str, ...]
     flux: float
@@ -370,6 +375,7 @@ def make_psfs(
         (pixel,) = middles
         steps.refuse_hole(unrepairable, pixel)
     combined: tuple[str, ...] = ()
+    error = PSF_ERROR
     far = max(resampling.reach(side, angle) for angle in angles) + MARGIN
     lowered, others = list[str](), list[str]()
     if width:
@@ -387,7 +393,7 @@ def make_psfs(
         centres = [(star.y, star.x) for star in stars.stars[: len(middles)]]
         flux = sum(star.flux for star in stars.stars)
         light, pixel, shift = flux * stars.psf, (far, far), None
-        scatter = flux * stars.scatter
+        scatter, error = flux * stars.scatter, stars.error
         combined = (*others, *effective.lines(stars))
     else:
         scatter = of_one(light, unusable, pixel, far)
@@ -399,6 +405,7 @@ def make_psfs(
         StarPsf(
             square.psf / square.flux,
             _turn_scatter(scatter, side, angle) / square.flux,
+            error,
             (*found, measured, *lowered, repaired, *centred, *combined),
             square.lines,
             square.flux,

@@ -9,6 +9,7 @@ from scipy.ndimage import convolve, gaussian_filter, maximum_filter
 
 from lnocl.core.scene.arrays import Array, Mask
 from lnocl.core.scene.noise_check import noise_of
+from lnocl.core.scene.psfs import MOST_PSF_ERROR, PSF_ERROR
 from lnocl.psf.centring import Pixel
 from lnocl.psf.steps import cut_square
 
@@ -102,6 +103,37 @@ def of_several(
     variance = np.tensordot(found, of_mean, axes=1) + found[2] * wide**2
     least = found[0] / fluxes.max() ** 2
     return np.sqrt(np.where(weight > 0, variance, least + _guess(psf) ** 2))
+
+
+def width_error(apart: Array, shown: Array, fluxes: Array, psf: Array, used: Mask) -> float:
+    r"""Return the error of the width of a PSF that is the mean of several stars, relative to it.
+
+    Star s is as wide as ``1 + a_s``, by least squares of its flux and a stretch of the PSF. Another
+    star differs as these do, and few of them tell little of it: with their shares w of the light
+
+    .. math:: e^2 = e_0^2 \sum_s w_s^2 + \sum_s w_s (a_s - \bar a)^2
+
+    with the error e_0 of a PSF that nothing is known of, as of one star. Noise is part of it. Stars
+    whose cores are hidden tell nothing.
+
+    Parameters
+    ----------
+    apart, shown, fluxes, psf : ndarray of float64
+        As of `of_several`.
+    used : ndarray of bool, shape (k, k)
+        The core, in which stars are fitted.
+    """
+    y, x = (np.arange(n) - n // 2 for n in psf.shape)
+    down, along = np.gradient(psf)
+    stretch = -(x * along + y[:, None] * down) - 2.0 * psf
+    weights, widths = fluxes / fluxes.sum(), np.zeros(len(fluxes))
+    for s, (left, seen) in enumerate(zip(apart, shown, strict=True)):
+        there = used & (seen > 0)
+        design = np.array([psf[there], stretch[there]]).T
+        if len(design) > 2:
+            widths[s] = np.linalg.lstsq(design, left[there], rcond=None)[0][1]
+    variance = float(weights @ (widths - weights @ widths) ** 2)
+    return min(float(np.sqrt(PSF_ERROR**2 * weights @ weights + variance)), MOST_PSF_ERROR)
 
 
 def _variances(squares: Array, design: Array, peak: float) -> Array:

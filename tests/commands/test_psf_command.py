@@ -18,6 +18,8 @@ from wcs_headers import NORTH_UP
 
 import lnocl
 from lnocl.commands import cli
+from lnocl.io.calibration import Calibration
+from lnocl.io.frames import read_frames
 from lnocl.psf import examine, make_psf, make_psfs
 
 SHAPE = (61, 70)
@@ -179,6 +181,7 @@ class TestWhatItMakes:
             np.testing.assert_array_equal(hdus[0].data, expected.psf)
             np.testing.assert_array_equal(hdus["SCATTER"].data, expected.scatter)
             assert hdus[0].header["NSTARS"] == 2
+            assert hdus[0].header["PSFERROR"] == expected.error < 0.03
         said = capsys.readouterr().out.splitlines()
         assert said[:-1] == list(expected.steps)
         assert [line.partition(":")[0] for line in said] == [
@@ -188,6 +191,17 @@ class TestWhatItMakes:
         ]  # fmt: skip
         words = shlex.split("\n".join(fits.getheader("out.fits")["HISTORY"]).replace("\\\n", ""))
         assert words.count("--star") == 2
+
+    @pytest.mark.parametrize(("given", "others"), [(None, []), (None, ["plain.fits"]), (0.2, [])])
+    def test_the_error_of_the_width_is_read_again_unless_one_is_given(self, capsys, given, others):
+        assert run("--star", "30,29", "--star", "50,45", "--size", "15", output="psf.fits") == 0
+        fits.writeto("plain.fits", fits.getdata("psf.fits"))
+        capsys.readouterr()
+        psfs = ["psf.fits", *others]
+        read = read_frames(["star.fits"] * len(psfs), psfs, Calibration(psf_error=given, gain=1.0))
+        made = fits.getheader("psf.fits")["PSFERROR"]
+        expected = given or max(made, 0.03 if others else 0.0)
+        assert read.observation.psf_error == expected
 
     @pytest.mark.exhaustive
     def test_the_scatter_is_written_and_read_again_unless_psfs_are_exact(self, capsys):

@@ -4,6 +4,8 @@ import numpy as np
 import pytest
 from star_frames import gaussian, quiet
 
+import lnocl
+from lnocl.core.scene.psfs import PSF_ERROR
 from lnocl.psf.make import make_psf
 from lnocl.psf.scatter import GUESSED
 
@@ -57,6 +59,45 @@ def test_stars_that_differ_show_it_and_fewer_leave_more_room():
     few, many = (np.linalg.norm(each) / differ for each in found)
     assert 0.5 < many < 5.0  # in proportion to the PSF, which widths beside the peak are not
     assert few > 1.1 * many
+
+
+@pytest.mark.parametrize("n", [2, 4, 6])
+def test_the_width_of_stars_that_are_alike_is_known_as_their_number_says(n):
+    """With all else of a PSF, by shares of the light; one star is as any PSF."""
+    rng = np.random.default_rng(4)
+    made = make_psf(a_frame(rng, n, 1e6), PLACES[:n], SIZE)
+    fluxes = 1e6 * np.random.default_rng(4).uniform(0.5, 1.5, n)
+    expected = PSF_ERROR * np.linalg.norm(fluxes) / fluxes.sum()
+    assert made.error == pytest.approx(expected, rel=0.03)
+    assert make_psf(a_frame(rng, 1, 1e6), PLACES[0], SIZE).error == PSF_ERROR
+
+
+@pytest.mark.parametrize("differ", [0.04, 0.15, 0.5])
+def test_stars_of_several_widths_raise_the_error_of_the_width(differ):
+    frame = a_frame(np.random.default_rng(5), 6, 1e6, widths=(3.2 - differ, 3.2 + differ))
+    fluxes = np.random.default_rng(5).uniform(0.5, 1.5, 6)
+    shares, widths = fluxes / fluxes.sum(), np.tile([-differ, differ], 3) / 3.2
+    variance = shares @ (widths - shares @ widths) ** 2
+    expected = np.sqrt(PSF_ERROR**2 * shares @ shares + variance)
+    assert make_psf(frame, PLACES, SIZE).error == pytest.approx(expected, rel=0.1)
+
+
+def test_an_observation_has_the_largest_error_of_its_psfs():
+    frame, images = a_frame(np.random.default_rng(6), 4, 1e6), np.full((2, 40, 40), 9.0)
+    one, four = (make_psf(frame, PLACES[:n], SIZE) for n in (1, 4))
+    for psfs, expected in (
+        (four, four.error),
+        ([four, four], four.error),
+        ([four, one], PSF_ERROR),
+        ([four, four.psf], PSF_ERROR),
+        (four.psf, PSF_ERROR),
+    ):
+        assert lnocl.Observation(images, psfs, psf_error=None).psf_error == expected
+    assert four.error < 0.7 * PSF_ERROR
+    assert lnocl.Observation(images, four, psf_error=0.1).psf_error == 0.1
+    exact = lnocl.Observation(images, four, psf_error=0)
+    assert exact.psf_error == 0
+    assert not len(exact.psf_scatter)
 
 
 def test_what_no_star_shows_is_a_guess():

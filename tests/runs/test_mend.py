@@ -9,9 +9,9 @@ from regions import CirclePixelRegion, PixCoord
 
 import lnocl
 from lnocl.core.runs.psf_refinement import _clean, _is_trusted, _settle, _State
-from lnocl.core.scene.fields import PSF_ERROR
 from lnocl.core.scene.psf_families import PsfFamilies
 from lnocl.core.scene.psf_misfit import PsfMisfit
+from lnocl.core.scene.psfs import PSF_ERROR
 from lnocl.errors import LnoclWarning
 
 pytestmark = pytest.mark.filterwarnings("ignore::lnocl.LnoclWarning")

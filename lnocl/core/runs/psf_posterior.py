@@ -38,8 +38,9 @@ from lnocl.process import ignored_notes, ignored_warnings
 
 # So many of the brightest stars tell of the PSFs.
 MOST_STARS = 4
-# Rounds of a run and of a step, and the longest step, standard deviations of the prior.
-ROUNDS, MAX_STEP = 3, 6.0
+# Rounds of a run and of a step, at most, and the longest step, and that after which none follows,
+# standard deviations of the prior: the third would be a third of it (docs/validation/psf_error.md).
+ROUNDS, MAX_STEP, SHORT = 3, 6.0, 0.3
 # What the `psf_error` of PSFs holds is an error of no more than so many times it.
 HELD = 2.0
 # The standard deviation of a place that is given, pixels.
@@ -93,6 +94,8 @@ def settle_psfs(
                 initial_extended=np.maximum(estimate.observed_sky, 0.0),
                 initial_star_fluxes=estimate.star_fluxes[: estimate.scene.n_stars],
             )
+            if abs(steps[-1]).max() < SHORT:
+                break
     return steps, setup.stars
 
 

@@ -25,13 +25,13 @@ from lnocl.core.runs.psf_posterior import HELD
 from lnocl.core.runs.start import Setup
 from lnocl.core.scene.arrays import Array
 from lnocl.core.scene.cores import fwhm
-from lnocl.core.scene.fields import MOST_PSF_ERROR
 from lnocl.core.scene.observation import Observation
 from lnocl.core.scene.psf_families import PsfFamilies, PsfParameters
 from lnocl.core.scene.psf_faults import name_faults
 from lnocl.core.scene.psf_field import Psfs, mapped
 from lnocl.core.scene.psf_misfit import PsfMisfit
 from lnocl.core.scene.psf_wings import are_noisy, without_noise
+from lnocl.core.scene.psfs import MOST_PSF_ERROR
 from lnocl.core.scene.star_psfs import owned
 from lnocl.core.solvers.psf_fit import step
 from lnocl.errors import counted, note, warn

@@ -24,7 +24,7 @@ from lnocl.core.scene.arrays import (
 )
 from lnocl.core.scene.geometry import read_geometry
 from lnocl.core.scene.halos import read_halos
-from lnocl.core.scene.psfs import read_ideal_psfs, read_pixels, read_psfs
+from lnocl.core.scene.psfs import MOST_PSF_ERROR, read_ideal_psfs, read_pixels, read_psfs
 from lnocl.core.scene.star_psfs import read_star_places, read_star_psfs
 from lnocl.core.scene.transforms import of_one_shape, refuse_other_shapes, shapes_of
 from lnocl.core.scene.uncertainties import is_uncertainty, without_source
@@ -36,10 +36,6 @@ if TYPE_CHECKING:
 # Pixels of the sky to one of an image, along each axis. The frequencies that an image cannot tell
 # apart are neighbours in the transform's order where this is a power of two (kernels/convolve.cl).
 OVERSAMPLES = 1, 2, 4
-
-
-# What real PSFs have, and the most that may be said of them.
-PSF_ERROR, MOST_PSF_ERROR = 0.03, 0.3
 
 
 class Given:

@@ -15,7 +15,6 @@ from lnocl.core.scene.containers import variances
 from lnocl.core.scene.counts import refuse_overflow, without_negative
 from lnocl.core.scene.fields import (
     FIELDS,
-    PSF_ERROR,
     hold,
     in_one_shape,
     noise_beyond_counts,
@@ -30,7 +29,7 @@ from lnocl.core.scene.psfs import (
     at_middle,
     normalised,
     own,
-    without_scatter,
+    without_errors,
 )
 from lnocl.core.scene.transforms import of_one_shape, shapes_of
 from lnocl.errors import InputError, counted
@@ -156,7 +155,7 @@ class Observation:
         (`lnocl.core.solvers.psf_errors`): blur along each axis, wings, shifts, single pixels, zero
         points of images. All of it is in the errors of stars, and what these show of it is taken
         into the PSFs of the reconstruction. By default 0.03, as real PSFs have
-        (:doc:`/validation/psf_priors`).
+        (:doc:`/validation/psf_priors`), or the `error` of PSFs of `lnocl.psf.make_psf`.
     star_psfs : array_like, shape (n, p, ky, kx), (p, ky, kx) or (ky, kx), optional
         PSFs of their own of the stars at `star_places`, such as one behind the mask of a
         coronagraph. All else has `psfs`: other stars, the extended source and what is tested. They
@@ -307,7 +306,7 @@ class Observation:
         pupils: ArrayLike | None = None,
         psf_modes: ArrayLike | None = None,
         psf_scatter: ArrayLike | None = None,
-        psf_error: float = PSF_ERROR,
+        psf_error: float | None = None,
         star_psfs: ArrayLike | None = None,
         star_places: ArrayLike | None = None,
     ) -> None:
@@ -315,8 +314,10 @@ class Observation:
         shapes = shapes_of(images) if transforms is not None else []
         if len(set(shapes)) > 1:
             given |= in_one_shape(given, shapes)
-        given["psfs"], scatter = without_scatter(psfs)
-        if psf_scatter is None and psf_error:
+        given["psfs"], scatter, of_made = without_errors(psfs)
+        if psf_error is None:
+            given["psf_error"] = of_made
+        if psf_scatter is None and psf_error != 0:
             given["psf_scatter"] = scatter
         shapes_of_psfs = shapes_of(given["psfs"])
         for name in ("psfs", "psf_scatter", "star_psfs"):

@@ -17,6 +17,9 @@ from lnocl.core.scene.shifting import place
 from lnocl.core.scene.transforms import enlarged
 from lnocl.errors import InputError, counted, note, warn
 
+# What real PSFs have, and the most that may be said of them.
+PSF_ERROR, MOST_PSF_ERROR = 0.03, 0.3
+
 if TYPE_CHECKING:
     from lnocl.core.scene.fields import Field
     from lnocl.core.scene.observation import Observation
@@ -86,22 +89,24 @@ def read_psfs(field: Field, psfs: Any, held: Observation) -> Array:
     return check_psfs(field.name, psfs, held.n_images)
 
 
-def without_scatter(psfs: Any) -> tuple[Any, Any]:
+def without_errors(psfs: Any) -> tuple[Any, Any, float]:
     """Return PSFs as arrays, and the scatter that those of `lnocl.psf.make_psf` carry, or None.
 
-    That of others among them is 0.
+    That of others among them is 0. The last is the largest error of a width, that of others
+    `PSF_ERROR`.
     """
     each = psfs if isinstance(psfs, (list, tuple)) else [psfs]
     are_made = [hasattr(one, "psf") and hasattr(one, "scatter") for one in each]
     if not any(are_made):
-        return psfs, None
+        return psfs, None, PSF_ERROR
+    error = max(getattr(one, "error", PSF_ERROR) for one in each)
     pairs = [
         (one.psf, one.scatter) if is_made else (one, np.zeros(np.shape(one)))
         for one, is_made in zip(each, are_made, strict=True)
     ]
     if each is not psfs:
-        return pairs[0]
-    return [psf for psf, _ in pairs], [scatter for _, scatter in pairs]
+        return *pairs[0], error
+    return [psf for psf, _ in pairs], [scatter for _, scatter in pairs], error
 
 
 def read_ideal_psfs(field: Field, ideals: Any, held: Observation) -> Array:

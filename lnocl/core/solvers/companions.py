@@ -29,7 +29,7 @@ from scipy.spatial import KDTree
 from lnocl.core.scene.arrays import Array, Mask
 from lnocl.core.scene.detector import on_sky
 from lnocl.core.scene.estimate import Estimate
-from lnocl.core.scene.fields import PSF_ERROR
+from lnocl.core.scene.psfs import PSF_ERROR
 from lnocl.core.scene.texture import Texture
 from lnocl.core.solvers.fluxes import variances
 from lnocl.core.solvers.least_squares import ROUNDING, LinearImage
