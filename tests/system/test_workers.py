@@ -1,5 +1,6 @@
 """Batches on a cluster of Dask that loses a worker and a connection, on the real engine."""
 
+import json
 import os
 import signal
 import threading
@@ -42,13 +43,22 @@ def targets(tmp_path, monkeypatch):
 
 
 def disturb(client, lost):
-    """Kill one worker after the other, and cut the connection a little later."""
-    lost += client.run(os.getpid).values()
-    for process, n_done in zip(lost, (N_TARGETS // 3, N_TARGETS // 2), strict=True):
+    """Kill two workers that have done something, and cut the connection a little later."""
+    for n_done in (N_TARGETS // 3, N_TARGETS // 2):
         await_results(n_done)
-        os.kill(process, signal.SIGKILL)
+        lost.append(next(each for each in processes_of_results() if each not in lost))
+        os.kill(lost[-1], signal.SIGKILL)
     await_results(N_TARGETS * 2 // 3)
     client.loop.add_callback(client.scheduler_comm.comm.abort)
+
+
+def processes_of_results():
+    """Return the processes that have done what is done, again and again until one is there."""
+    while True:
+        for record in Path("two").glob("*.json"):
+            if ":" in (process := json.loads(record.read_text()).get("process") or ""):
+                yield int(process.split(":")[1])
+        time.sleep(0.01)
 
 
 def await_results(number):
