@@ -155,7 +155,7 @@ class Observation:
         (`lnocl.core.solvers.psf_errors`): blur along each axis, wings, shifts, single pixels, zero
         points of images. All of it is in the errors of stars, and what these show of it is taken
         into the PSFs of the reconstruction. By default 0.03, as real PSFs have
-        (:doc:`/validation/psf_priors`), or the `error` of PSFs of `lnocl.psf.make_psf`.
+        (:doc:`/validation/psf_priors`), or what PSFs of ``lnocl psf`` bring, less by several stars.
     star_psfs : array_like, shape (n, p, ky, kx), (p, ky, kx) or (ky, kx), optional
         PSFs of their own of the stars at `star_places`, such as one behind the mask of a
         coronagraph. All else has `psfs`: other stars, the extended source and what is tested. They
