@@ -16,7 +16,7 @@ from lnocl.core.scene.transforms import enlarged
 from lnocl.errors import InputError, counted, note, warn
 from lnocl.io.calibration import Calibration, Word
 from lnocl.io.electrons import Electrons
-from lnocl.io.fitsread import read_extension, read_stack
+from lnocl.io.fitsread import keyword_number, read_extension, read_stack
 from lnocl.io.image_files import ImageFiles
 from lnocl.io.levels import sky_level, sky_noise
 from lnocl.io.masks import read_mask
@@ -174,10 +174,11 @@ class _Reader:
         """Return the error that was given, or the largest that files of PSFs have."""
         if self._calibration.psf_error is not None:
             return self._calibration.psf_error
-        found = [header.get(WIDTH_ERROR) for header in self._psfs.headers]
-        if any(error is not None for error in found):
-            note(f"{WIDTH_ERROR}, the error of the width of PSFs, is taken from files of PSFs")
-        return max(PSF_ERROR if error is None else float(error) for error in found)
+        found = [
+            keyword_number(self._psfs, self._psf_paths, "psf_error", j, WIDTH_ERROR)
+            for j in range(len(self._psf_paths))
+        ]
+        return max(PSF_ERROR if error is None else error for error in found)
 
     def _psf_errors(self) -> dict[str, Any]:
         """Return the ideal PSFs, pupils, modes and scatter that were given."""

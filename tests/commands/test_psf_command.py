@@ -203,6 +203,13 @@ class TestWhatItMakes:
         expected = given or max(made, 0.03 if others else 0.0)
         assert read.observation.psf_error == expected
 
+    @pytest.mark.parametrize(("word", "why"), [("wide", "not a number"), (0.7, "from 0 to 0.3")])
+    def test_an_error_of_the_width_that_is_none_is_refused(self, word, why):
+        header = fits.Header({"PSFERROR": word})
+        fits.writeto("odd.fits", make_psf(FRAME, (30, 29), 15).psf, header)
+        with pytest.raises(lnocl.InputError, match=why):
+            read_frames(["star.fits"], ["odd.fits"], Calibration(psf_error=None, gain=1.0))
+
     @pytest.mark.exhaustive
     def test_the_scatter_is_written_and_read_again_unless_psfs_are_exact(self, capsys):
         """Of one star too; and all that is asked of the result has it."""

@@ -238,7 +238,7 @@ def _slopes_at(
     return seen._replace(values=seen.values[1:] - seen.values[0])
 
 
-@remembered(2**25)  # as those of all stars
+@remembered(2**27)  # as those of all stars
 def _with_slopes(
     psf: Movable, error: float, most: tuple[int, int], images: tuple[int, int]
 ) -> Movable:
