@@ -178,9 +178,7 @@ def keyword_number(
     if value is None:
         return None
     if isinstance(value, bool) or not isinstance(value, (int, float)):
-        raise InputError(
-            f"{keyword} of {path} is {value!r}, not a number; give `{name}` as a number"
-        )
+        raise InputError(f"{keyword} of {path} is {value!r}, not a number; give `{name}` as one")
     note("`images[%d]`: %s %g%s, from %s", j, name.replace("_", " "), value, unit, keyword)
     return float(value)
 
