@@ -127,7 +127,7 @@ def state(kappa, flux, seen=1.0):
     misfit = PsfMisfit(squares, seen, 1.0, 100.0, np.zeros(1))
     fluxes, scene = np.array([1e4, flux]), SimpleNamespace(n_stars=2, places=np.ones((2, 2)))
     estimate = SimpleNamespace(misfit=misfit, star_fluxes=fluxes, scene=scene)
-    return _State(PSF, estimate, False)
+    return _State(PSF, scene.places, False, lambda: estimate)
 
 
 def test_a_sharper_psf_that_takes_the_star_away_is_refused():
@@ -143,18 +143,36 @@ def test_psfs_that_leave_no_star_to_judge_by_are_refused():
     assert not before.is_mended_by(state(0.19, 1e4))
 
 
+def settling(found, light=1e4):
+    """Return runs in which PSFs that the stars show are judged so."""
+    fluxes = np.array([1e4, light])
+    settled = lambda psfs, places, moves: (psfs.copy(), places + moves, fluxes)  # noqa: E731
+    return SimpleNamespace(stars=None, settled=settled, fit=lambda *_: found.estimate)
+
+
 @pytest.mark.parametrize("is_moved", [False, True])
 def test_psfs_and_places_that_stars_show_are_used_unless_they_fit_worse(is_moved):
-    before, psfs = state(0.2, 1e4), PSF.copy()
+    before = state(0.2, 1e4)
     for kappa, is_used in ((0.1, True), (0.21, True), (0.25, False)):
-        runs = SimpleNamespace(stars=None, settled=lambda _, places, moves: (psfs, places + moves))
-        runs.fit = lambda *_, kappa=kappa: state(kappa, 1e4).estimate
-        found = _settle(runs, before, is_moved)
-        assert found.psfs is (psfs if is_used else PSF)
+        found = _settle(settling(state(kappa, 1e4)), before, is_moved)
+        assert (found.psfs is not PSF) == is_used
         assert found.moves == (is_used and is_moved)
         assert found.misfit.kappa == pytest.approx(kappa if is_used else 0.2)
-    runs.fit = lambda *_: state(0.0, 0.4e4).estimate  # a star has lost its light
-    assert _settle(runs, before, is_moved) is before
+    faded = settling(state(0.0, 0.4e4))  # a star has lost its light
+    assert _settle(faded, before, is_moved) is before
+
+
+def test_psfs_before_are_judged_only_where_those_of_the_stars_are_in_doubt_or_take_light():
+    asked = []
+    before = state(0.2, 1e4)
+    lazy = _State(PSF, before.stars, False, lambda: asked.append(0) or before.estimate)
+    assert _settle(settling(state(0.0, 1e4)), lazy, False) is not lazy
+    assert not asked
+    assert _settle(settling(state(0.0, 1e4), light=2.1e4), lazy, False) is not lazy
+    assert len(asked) == 1
+    again = _State(PSF, before.stars, False, lazy.judge)
+    assert _settle(settling(state(0.25, 1e4)), again, False) is again
+    assert len(asked) == 2
 
 
 def test_free_pixels_are_refused_that_fit_in_part_or_change_a_flux_by_more_than_the_error():

@@ -8,6 +8,7 @@ from scipy.ndimage import gaussian_filter
 
 import lnocl
 from lnocl.core.runs import psf_posterior
+from lnocl.core.runs.guarded_runs import GuardedRuns
 from lnocl.core.runs.outcome import PsfRefinement
 from lnocl.core.runs.psf_refinement import mend
 from lnocl.core.runs.start import Setup
@@ -139,7 +140,7 @@ def test_a_companion_is_not_taken_for_the_psf_where_little_is_wrong():
     known = {"exposure": DEPTHS[:1], "psf_error": 0.03}
     observation = observe(TRUE[:1], [TRUE[0] / 1.05], sky=companion, **known)
     with pytest.warns(lnocl.errors.LnoclWarning, match="the PSFs do not fit"):
-        found = mend(setup_of(observation), ("pixels",), False, False)
+        found = mend(GuardedRuns(setup_of(observation)), ("pixels",), False, False)
     assert fwhm(found.setup.observation.psfs[0]) > 1.02 * fwhm(observation.psfs[0])
     assert not found.refinement.has_free_pixels
 
@@ -221,7 +222,7 @@ def test_stars_are_moved_that_lie_off_where_psfs_are_fitted(shift):
     penalty = Penalty(smoothing=3 * recommend_smoothing(observation))
     _, places = psf_posterior.settle_psfs(setup_of(observation, [given]), penalty, True)
     assert places[0] == pytest.approx(STAR if shift > 0.1 else given, abs=0.06)
-    found = mend(setup_of(observation, [given]), ("jitter",), False, False)
+    found = mend(GuardedRuns(setup_of(observation, [given])), ("jitter",), False, False)
     assert not found.setup.refine_positions
 
 
@@ -236,7 +237,7 @@ def test_jitter_and_pixels_are_fitted_and_fluxes_not_marginal_beyond_what_is_hel
     lobed = kernel * (1 + 0.35 * np.cos(3 * np.arctan2(y, x)) * r / (r + 3))
     observation = observe(TRUE[:1], TRUE[:1], exposure=[1.0], psf_error=error)
     observation = observation.replace(psfs=lobed / lobed.sum())
-    found = mend(setup_of(observation), ("jitter", "pixels"), "auto", False)
+    found = mend(GuardedRuns(setup_of(observation)), ("jitter", "pixels"), "auto", False)
     assert found.is_within == is_within
     assert not found.fits
     assert 0.06 < found.refinement.psf_error < 0.1

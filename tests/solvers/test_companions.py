@@ -190,7 +190,8 @@ def test_points_are_looked_for_through_psfs_without_the_noise_of_their_wings(mon
         GuardedRuns, "setup_of", lambda runs, psfs, _: seen.append(psfs) or runs._setup
     )
     for each in (observation, noisy):
-        beside_stars(Setup(each, np.array([STAR]), 0, "sgp", "double", "numpy", None))
+        setup = Setup(each, np.array([STAR]), 0, "sgp", "double", "numpy", None)
+        beside_stars(GuardedRuns(setup))
     np.testing.assert_array_equal(seen[0], observation.psfs)
     assert noisy.psfs.min() < -1e-4
     assert seen[1].min() >= 0

@@ -2,16 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import replace
 
 import numpy as np
 
 from lnocl.core.runs.guarded_runs import GuardedRuns
-from lnocl.core.runs.halos import settle_halos
-from lnocl.core.runs.start import Setup, make_start
-from lnocl.core.runs.steady import run_steadily
 from lnocl.core.scene.arrays import Array
 from lnocl.core.scene.psf_field import mapped
 from lnocl.core.scene.psf_wings import are_noisy, without_noise
@@ -19,32 +14,19 @@ from lnocl.core.solvers.companions import companions
 from lnocl.errors import DivergedError, NotFiniteError, counted, note
 from lnocl.process import ignored_notes, ignored_warnings
 
-# Iterations of a run, at most.
-N_ITER = 300
 
-
-def beside_stars(setup: Setup, tick: Callable[[], object] = int) -> Array:
+def beside_stars(runs: GuardedRuns) -> Array:
     """Return the places of points that a run of a window round the stars shows, shape (n, 2).
 
     They are those of `lnocl.core.solvers.companions`, (x, y), pixels of the images. The noise of
     wings, which may look like one, is taken from the PSFs.
-
-    Parameters
-    ----------
-    setup : Setup
-        The images and the parameters of the runs; one star or more among them.
-    tick : callable, optional
-        Is called after each iteration.
     """
-    runs, places, observation = GuardedRuns(setup), np.zeros((0, 2)), setup.observation
+    places, observation = np.zeros((0, 2)), runs.whole.observation
     psfs = observation.psfs_over_images
     if are_noisy(observation.psfs):
         psfs = mapped(psfs, lambda _, stack: without_noise(stack, observation.oversample))
-    near = runs.setup_of(psfs, runs.stars)
-    near = replace(near, refine_positions=False)
     with suppress(DivergedError, NotFiniteError), ignored_warnings(), ignored_notes():
-        start = settle_halos(make_start(near, runs.penalty))
-        _, found = companions(run_steadily(start, runs.penalty, N_ITER, tick).estimate)
+        _, found = companions(runs.steady(psfs, runs.stars))
         offset = runs.all_stars[runs.held][0] - runs.stars[0]
         places = np.reshape([each.place + offset for each in found], (-1, 2))
     if len(places):

@@ -13,7 +13,7 @@ import math
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,7 +24,7 @@ from lnocl.core.runs.halos import hold_halos, settle_halos
 from lnocl.core.runs.psf_posterior import settle_psfs
 from lnocl.core.runs.run import Run
 from lnocl.core.runs.start import Setup, make_model, make_start
-from lnocl.core.runs.steady import STEADY
+from lnocl.core.runs.steady import STEADY, steady_estimate
 from lnocl.core.scene.arrays import Array
 from lnocl.core.scene.estimate import Estimate
 from lnocl.core.scene.forward_model import Model
@@ -92,6 +92,8 @@ class GuardedRuns:
 
     Attributes
     ----------
+    whole : Setup
+        The parameter `setup`.
     observation : Observation
         The images in the window, without their PSFs; their noise is that of the whole images.
     stars : ndarray of float64, shape (n, 2)
@@ -105,8 +107,7 @@ class GuardedRuns:
     """
 
     def __init__(self, setup: Setup, tick: Callable[[], object] = int) -> None:
-        self._tick, self._whole = tick, setup.observation
-        observation = setup.observation
+        self.whole, self._tick, observation = setup, tick, setup.observation
         self.all_stars = setup.stars
         # PSFs that are cut to the window go without what has the shape of whole ones.
         shown = with_noise_shown(observation).replace(**dict.fromkeys(BESIDE_PSFS))
@@ -123,6 +124,7 @@ class GuardedRuns:
             setup, solver="sgp", pad=pad, initial_extended=None, initial_star_fluxes=None
         )
         self.penalty = Penalty(smoothing=STEADY * recommend_smoothing(self.observation))
+        self._steady = list[tuple[Estimate, Psfs, Array]]()
 
     def setup_of(self, psfs: Psfs, stars: Array) -> Setup:
         """Return the setup of a run with PSFs of the whole images and stars of the window."""
@@ -168,18 +170,36 @@ class GuardedRuns:
                     break
         return found
 
-    def settled(self, psfs: Psfs, stars: Array, moves: bool) -> tuple[Psfs, Array]:
+    def steady(self, psfs: Psfs, stars: Array) -> Estimate:
+        """Return the estimate of a run with one weight, which is kept for the same PSFs and stars.
+
+        Raises
+        ------
+        DivergedError, NotFiniteError
+            As `run_steadily`.
+        """
+        for found, of_psfs, of_stars in self._steady:
+            if of_psfs is psfs and np.array_equal(of_stars, stars):
+                return found
+        found = steady_estimate(self.setup_of(psfs, stars), self.penalty, self._tick)
+        self._steady = [(found, psfs, stars)]
+        return found
+
+    def settled(self, psfs: Psfs, stars: Array, moves: bool) -> tuple[Psfs, Array, Array]:
         """Return PSFs, of the whole images, and stars, in the window, as the images show them.
 
-        Those given are returned where they stay. Stars stay unless they may move.
+        Those given are returned where they stay. Stars stay unless they may move. The third is the
+        fluxes of the stars through the PSFs given, electrons; none where they stay.
         """
-        setup = self.setup_of(psfs, stars)
-        steps, found = settle_psfs(setup, self.penalty, moves, self._tick)
-        whole = self._whole.replace(psfs=psfs)
+        setup, first = self.setup_of(psfs, stars), partial(self.steady, psfs, stars)
+        steps, found = settle_psfs(setup, self.penalty, moves, self._tick, first)
+        if not steps:
+            return psfs, stars, np.zeros(0)
+        whole, before = self.whole.observation.replace(psfs=psfs), first()
         for step in steps:
             whole = with_errors(whole, step)
         moved = np.where(found == setup.stars, stars, found)
-        return (whole.psfs_over_images if steps else psfs), moved
+        return whole.psfs_over_images, moved, before.star_fluxes[: before.scene.n_stars]
 
     def _run(self, setup: Setup, found: Judged, n_iter: int, guard: float) -> Judged:
         """Return the estimate after a run that begins at `found`, with its misfit measured anew.

@@ -119,18 +119,21 @@ def _judge_psfs(plan: Plan, setup: Setup, progress: bool) -> Mended:
     otherwise. Exact ones are wrong by the scatter that is given.
     """
     from lnocl.core.runs.companions import beside_stars  # which loads scipy
+    from lnocl.core.runs.guarded_runs import GuardedRuns
     from lnocl.core.runs.psf_refinement import MOST_STARS, mend
 
     known, judged = setup.observation.psf_scatter, setup
     if setup.observation.psf_error and len(known):
         judged = replace(setup, observation=setup.observation.replace(psf_scatter=None))
-    mended, held = Mended(judged), judged
+    mended = Mended(judged)
     judging = Progress(None, "it", bool(progress), "judging the PSFs", stays=False)
     with judging, suppress(NotFiniteError):  # of which the run itself tells
-        if plan.families and setup.observation.psf_error and len(setup.stars) <= MOST_STARS:
-            points = beside_stars(setup, judging.update)
+        runs = GuardedRuns(judged, judging.update)
+        may_hide = plan.families and setup.observation.psf_error and len(setup.stars) <= MOST_STARS
+        if may_hide and len(points := beside_stars(runs)):
             held = replace(judged, stars=np.concatenate([setup.stars, points]))
-        mended = mend(held, plan.families, plan.moves, plan.is_asked, judging.update)
+            runs = GuardedRuns(held, judging.update)
+        mended = mend(runs, plan.families, plan.moves, plan.is_asked)
         mended = mended._replace(setup=replace(mended.setup, stars=setup.stars))
     if judged is setup:
         return mended

@@ -15,9 +15,8 @@ from dataclasses import replace
 import numpy as np
 from scipy.linalg import block_diag
 
-from lnocl.core.runs.halos import settle_halos
-from lnocl.core.runs.start import Setup, make_start
-from lnocl.core.runs.steady import run_steadily
+from lnocl.core.runs.start import Setup
+from lnocl.core.runs.steady import steady_estimate
 from lnocl.core.scene.arrays import Array
 from lnocl.core.scene.cores import fwhm
 from lnocl.core.scene.estimate import Estimate
@@ -47,12 +46,14 @@ HELD = 2.0
 AWAY = 1.0
 # The share of the gradient at which conjugate gradients end.
 FINISHED = 1e-2
-# Iterations of a run, at most.
-N_ITER = 300
 
 
 def settle_psfs(
-    setup: Setup, penalty: Penalty, moves: bool, tick: Callable[[], object] = int
+    setup: Setup,
+    penalty: Penalty,
+    moves: bool,
+    tick: Callable[[], object] = int,
+    first: Callable[[], Estimate] | None = None,
 ) -> tuple[list[Array], Array]:
     """Return steps of theta, shape (n_psfs, N_SHAPES) each, and the places of the stars.
 
@@ -72,8 +73,9 @@ def settle_psfs(
         Whether stars may be moved.
     tick : callable, optional
         Is called after each iteration.
+    first : callable, optional
+        Returns the estimate of the first run, where another may have made it.
     """
-    setup = replace(setup, solver="sgp", refine_positions=False)
     theta, steps = np.zeros((count(setup.observation), N_SHAPES)), list[Array]()
     of_psfs = dict(zip(alike(setup.observation).tolist(), setup.observation.psfs, strict=True))
     is_sampled = np.array([fwhm(of_psfs[k]) >= NARROWEST for k in range(len(theta))])
@@ -81,8 +83,7 @@ def settle_psfs(
         return steps, setup.stars
     with suppress(DivergedError, NotFiniteError), ignored_warnings(), ignored_notes():
         for _ in range(ROUNDS):
-            start = settle_halos(make_start(setup, penalty))
-            estimate = run_steadily(start, penalty, N_ITER, tick).estimate
+            estimate = first() if first and not steps else steady_estimate(setup, penalty, tick)
             found, away = _mean(estimate, theta, moves)
             step = np.where(is_sampled[:, None], found - theta, 0.0)
             steps.append(step * MAX_STEP / max(float(abs(step).max()), MAX_STEP))

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -62,20 +63,40 @@ MAX_HALVED = 10
 
 @dataclass(frozen=True)
 class _State:
-    """PSFs, the estimate by which they are judged, and whether stars may move for them."""
+    """PSFs, the places of stars for them, whether these move, and how to make their estimate."""
 
     psfs: Psfs
-    estimate: Judged
+    stars: Array
     moves: bool
+    judge: Callable[[], Judged]
+
+    @classmethod
+    def of(cls, runs: GuardedRuns, psfs: Psfs, stars: Array, moves: bool, **how: float) -> _State:
+        """Return the state of PSFs that runs judge when they are first asked."""
+        return cls(psfs, stars, moves, lambda: runs.fit(psfs, stars, moves, **how))
+
+    @cached_property
+    def estimate(self) -> Judged:
+        return self.judge()
 
     @property
     def misfit(self) -> PsfMisfit:
         return self.estimate.misfit
 
+    @property
+    def places(self) -> Array:
+        """The places of the stars, moved where they may be."""
+        return self.estimate.scene.places if self.moves else self.stars
+
+    @property
+    def star_fluxes(self) -> Array:
+        """The fluxes of the stars, electrons."""
+        return self.estimate.star_fluxes[: self.estimate.scene.n_stars]
+
     def is_mended_by(self, other: _State) -> bool:
         """Return whether other PSFs or positions mend enough to be taken."""
         before, after = self.misfit, other.misfit
-        if (_of_stars(other) < FADED * _of_stars(self)).any():
+        if (other.star_fluxes < FADED * self.star_fluxes).any():
             return False  # a sharper PSF, and the star's light in the extended source
         if after.expected < FADED * before.expected:
             return False  # stars that dominate nowhere show no misfit
@@ -83,18 +104,13 @@ class _State:
         return is_less and (not after.is_doubtful or after.kappa < MENDED * before.kappa)
 
 
-def mend(
-    setup: Setup,
-    names: Sequence[str],
-    moves: bool | str,
-    is_asked: bool,
-    tick: Callable[[], object] = int,
-) -> Mended:
+def mend(runs: GuardedRuns, names: Sequence[str], moves: bool | str, is_asked: bool) -> Mended:
     """Return a setup whose positions and PSFs are mended where the images ask for it.
 
     The noise of PSFs that have negative pixels, but for exact ones that fit, is taken from their
     wings first, unless they fit worse so. PSFs that may have an error then become the
-    mean of what the stars show of it (`lnocl.core.runs.psf_posterior`), unless they fit worse so.
+    mean of what the stars show of it (`lnocl.core.runs.psf_posterior`), unless they are in doubt
+    and fit worse so.
     Where they are off by no more than that error holds, neither jitter nor pixels are fitted
     unasked, and stars take their marginal fluxes. Where they are off by more, the error is raised
     at the end to what holds it.
@@ -108,25 +124,23 @@ def mend(
 
     Parameters
     ----------
-    setup : Setup
-        The images, the given PSFs and the parameters of the runs; one star or more among them.
+    runs : GuardedRuns
+        Those of the images and the given PSFs.
     names : sequence of str
         Families of `PsfFamilies` that may be refined.
     moves : bool or "auto"
         Whether stars are moved; "auto": where that mends a misfit.
     is_asked : bool
         Whether the outcome is wanted though PSFs may fit.
-    tick : callable, optional
-        Is called after each iteration of the runs.
     """
-    observation, runs = setup.observation, GuardedRuns(setup, tick)
+    setup, observation = runs.whole, runs.whole.observation
     if len(runs.stars) > MOST_STARS and not (is_asked or len(observation.psf_scatter)):
         number = counted(len(runs.stars), "star")
         note(f"PSFs are not judged: {number} in the window; name `refine_psfs` to judge them")
         return Mended(setup)
     psfs = observation.psfs_over_images
-    given = state = _State(psfs, runs.fit(psfs, runs.stars, moves is True), moves is True)
-    may_err = state.misfit.is_doubtful or bool(observation.psf_error)
+    given = state = _State.of(runs, psfs, runs.stars, moves is True)
+    may_err = bool(observation.psf_error) or state.misfit.is_doubtful
     if names and may_err and are_noisy(observation.psfs):
         state = _clean(runs, state)
     done = ["the noise of wings taken"] if state.psfs is not psfs else []
@@ -198,33 +212,31 @@ def _is_held(misfit: PsfMisfit, observation: Observation) -> bool:
     return bool(error) and misfit.kappa <= HELD * error
 
 
-def _of_stars(state: _State) -> Array:
-    """Return the fluxes of the stars, electrons."""
-    return state.estimate.star_fluxes[: state.estimate.scene.n_stars]
-
-
 def _shows_pixels(misfit: PsfMisfit) -> bool:
     """Return whether a misfit is enough for free pixels, which else follow the noise."""
     return misfit.is_significant or misfit.kappa > FREED
 
 
 def _settle(runs: GuardedRuns, state: _State, moves: bool) -> _State:
-    """Return the state with PSFs that are the mean of what they may be, unless they fit worse."""
-    places = state.estimate.scene.places
-    psfs, stars = runs.settled(state.psfs, places, moves)
-    is_moved = bool((stars != places).any())
+    """Return the state with PSFs that are the mean of what they may be, unless they fit worse.
+
+    Those before are judged too where these are in doubt, or a star has lost its light to them.
+    """
+    psfs, stars, before = runs.settled(state.psfs, state.places, moves)
+    is_moved = bool((stars != state.places).any())
     if psfs is state.psfs and not is_moved:
         return state
-    moves = state.moves or is_moved
-    settled = _State(psfs, runs.fit(psfs, stars, moves), moves)
+    settled = _State.of(runs, psfs, stars, state.moves or is_moved)
+    if not settled.misfit.is_doubtful and (settled.star_fluxes >= FADED * before).all():
+        return settled
     is_worse = settled.misfit.significance > state.misfit.significance + GONE
-    is_faded = (_of_stars(settled) < FADED * _of_stars(state)).any()
+    is_faded = (settled.star_fluxes < FADED * state.star_fluxes).any()
     return state if is_worse or is_faded else settled
 
 
 def _move(runs: GuardedRuns, state: _State) -> _State:
     """Return the state with the stars where they fit best, where that mends it."""
-    moved = replace(state, estimate=runs.fit(state.psfs, runs.stars, True), moves=True)
+    moved = _State.of(runs, state.psfs, runs.stars, True)
     return moved if state.is_mended_by(moved) else state
 
 
@@ -236,8 +248,7 @@ def _clean(runs: GuardedRuns, state: _State) -> _State:
     """
     q = runs.observation.oversample
     psfs = mapped(state.psfs, lambda _, stack: without_noise(stack, q))
-    stars = state.estimate.scene.places
-    cleaned = _State(psfs, runs.fit(psfs, stars, state.moves), state.moves)
+    cleaned = _State.of(runs, psfs, state.places, state.moves)
     is_worse = cleaned.misfit.significance > state.misfit.significance + GONE
     return state if is_worse else cleaned
 
@@ -265,8 +276,7 @@ def _loosen(runs: GuardedRuns, state: _State) -> _State:
 
     One that is kept from the stars more strongly leaves its own errors to pixels that are free.
     """
-    stars = state.estimate.scene.places
-    return replace(state, estimate=runs.fit(state.psfs, stars, state.moves, guard=STRENGTH))
+    return _State.of(runs, state.psfs, state.places, state.moves, guard=STRENGTH)
 
 
 def _free_pixels(runs: GuardedRuns, scatter: Array, state: _State, moves: bool) -> _State:
@@ -279,7 +289,8 @@ def _free_pixels(runs: GuardedRuns, scatter: Array, state: _State, moves: bool) 
     families = PsfFamilies(("pixels",), observation, scatter)
     parameters, found = _search(runs, families, families.first(), state, moves, STRENGTH)
     changes = [families.correction(j, parameters) for j in range(observation.n_images)]
-    return replace(found, psfs=runs.completed(state.psfs, changes))
+    psfs = runs.completed(state.psfs, changes)
+    return _State(psfs, found.stars, found.moves, lambda: found.estimate)
 
 
 def _is_trusted(tried: _State, state: _State, given: float) -> bool:
@@ -288,7 +299,7 @@ def _is_trusted(tried: _State, state: _State, given: float) -> bool:
     The wings of free PSFs may take the light of a host, and their cores that of a star. The state
     is the one that they begin from; given is kappa before, which families may have lowered.
     """
-    before, after = _of_stars(state), _of_stars(tried)
+    before, after = state.star_fluxes, tried.star_fluxes
     is_near = abs(after - before) <= state.misfit.kappa * before
     is_fitted = tried.misfit.kappa < FITTED * given
     return is_fitted and bool(is_near.all())
@@ -308,9 +319,11 @@ def _search(
     for _ in range(ROUNDS):
         parameters, stars = _step(runs, families, parameters, estimate, moves)
         psfs = families.psfs_over_images(parameters)
-        estimate = runs.fit(psfs, stars, moves, min(FIRST_ERROR, LOOSE * error), guard)
+        how = {"error": min(FIRST_ERROR, LOOSE * error), "guard": guard}
+        tried = _State.of(runs, psfs, stars, moves, **how)
+        estimate = tried.estimate
         gain = found[-1][1].misfit.significance - estimate.misfit.significance if found else np.inf
-        found.append((parameters, _State(psfs, estimate, moves)))
+        found.append((parameters, tried))
         if gain < IMPROVED:
             break
         error = estimate.misfit.kappa

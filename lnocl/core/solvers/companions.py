@@ -252,8 +252,6 @@ def _with_points(
     away = [np.hypot(*(each.place - estimate.scene.stars).T).min() for each in fitted]
     if min(away) * estimate.scene.oversample < NEAREST * width:
         return None
-    if any(each.flux < CLEAR * each.errors[0] for each in fitted):
-        return None
     return holding(estimate, fitted, width), fitted
 
 
@@ -274,30 +272,37 @@ def _fitted(
 ) -> Companion | None:
     """Return a point, the star `first`, after a step to where it fits; None where it has no light.
 
-    Its flux is the mean over epochs. The errors of its place are those of the last step.
+    Its flux is the mean over epochs. It has errors after the last step, where it is to be clear.
     """
     near = NearStar(Surroundings(estimate, True, raised), first, FINISHED)
-    change, change_error, step = step_of(near, first, estimate.scene.n_epochs)
+    change, change_error, step = step_of(near, first, estimate.scene.n_epochs, not is_last)
     flux, at = point.flux + change * estimate.scene.unit, near.unknowns[0, 1:]
     if flux <= 0 or not np.isfinite(variances(near.fit.information)[at]).all():
         return None
-    of_place = np.sqrt(near.fit.variances(at)) if is_last else point.errors[1:]
-    errors = np.array([change_error * estimate.scene.unit, *of_place])
+    errors = point.errors
+    if is_last:
+        error = change_error * estimate.scene.unit
+        if flux < CLEAR * error:
+            return None
+        errors = np.array([error, *np.sqrt(near.fit.variances(at))])
     place = point.place + step[at].clip(-MOVED, MOVED)
     return Companion(place, flux, errors, point.significance)
 
 
-def step_of(near: NearStar, first: int, n_epochs: int) -> tuple[float, float, Array]:
+def step_of(
+    near: NearStar, first: int, n_epochs: int, is_rough: bool = False
+) -> tuple[float, float, Array]:
     """Return how the flux of a star changes, in the mean of its epochs from `first` on.
 
     That is the change, scaled, and its error, minus and plus infinity where no epoch determines it;
-    and the changes of all unknowns.
+    and the changes of all unknowns. Rough errors, and weights of epochs, take fields as known.
     """
+    direct = variances(near.fit.information)
     at = near.unknowns[np.isin(near.held, np.arange(first, first + n_epochs)), 0]
-    at = at[np.isfinite(variances(near.fit.information)[at])]
+    at = at[np.isfinite(direct[at])]
     if not len(at):
         return -np.inf, np.inf, np.zeros(near.n)
     change, _ = near.fit.solve()
-    weights = 1.0 / near.fit.variances(at)
+    weights = 1.0 / (direct[at] if is_rough else near.fit.variances(at))
     mean = float((weights * change[at]).sum() / weights.sum())
     return mean, float(weights.sum() ** -0.5), change
