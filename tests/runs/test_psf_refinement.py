@@ -280,6 +280,34 @@ def test_many_stars_with_large_psfs_are_judged_in_a_smaller_window(n, oversample
     assert len(held) > 3
 
 
+@pytest.mark.parametrize(
+    ("shape", "width", "stars", "side"),
+    [
+        ((64, 64), 100, [(30, 30)], 256),  # no PSF is cut
+        ((256, 200), 61, [(128, 115)], 128),
+        ((256, 200), 65, [(128, 115)], 256),
+        ((256, 200), 61, [(3, 250)], 128),  # beyond the images nothing is seen
+        ((300, 200), 21, [(128, 115), (140, 130)], 64),
+        ((300, 200), 21, [(128, 115), (152, 130)], 128),
+    ],
+)
+def test_psfs_are_judged_in_a_window_as_wide_as_stars_and_psfs_need(shape, width, stars, side):
+    observation = lnocl.Observation(np.ones(shape), np.ones((3, 3)))
+    stars = np.array(stars, float)
+    assert guarded_runs.choose_window(stars, observation, (width, 9)) == side
+
+
+@pytest.mark.parametrize(("shift", "side"), [(5, 64), (20, 128), (50, 256), (-100, 64)])
+@pytest.mark.parametrize("turn", [0.0, 0.01])
+def test_a_window_is_wide_enough_in_all_images_that_see_a_star(shift, side, turn):
+    moved = np.array([[1.0, -turn, shift], [turn, 1.0, 0.0]])
+    observation = lnocl.Observation(
+        np.ones((2, 300, 300)), np.ones((2, 3, 3)), transforms=np.array([np.eye(2, 3), moved])
+    )
+    found = guarded_runs.choose_window(np.array([(70.0, 100.0)]), observation, (21, 9))
+    assert found == side
+
+
 def test_a_star_may_leave_the_images_while_psfs_are_judged():
     y, x = np.indices((17, 17)) - 8.0
     y_image, x_image = np.indices((40, 40))

@@ -42,8 +42,9 @@ from lnocl.core.solvers.psf_fit import settle
 from lnocl.errors import DivergedError, InputError
 from lnocl.process import ignored_notes, ignored_warnings
 
-# PSFs are judged in a window of this side, pixels of the images; in a half or a quarter of it where
-# the PSFs of its stars have more pixels than this together, since each step computes all of them.
+# PSFs are judged in a window of this side, pixels of the images. It is a half or a quarter where
+# that holds the same stars, each as far from its edges as its PSF is wide, or where the PSFs of its
+# stars have more pixels than this together, since each step computes all of them.
 WINDOW, LEAST_WINDOW, MOST_PIXELS = 256, 64, 2**22
 # The error that PSFs are first taken to have; later ones are measured until they change by less
 # than this share, or so often.
@@ -270,13 +271,27 @@ def inside(stars: Array, observation: Observation) -> Array:
 
 def choose_window(stars: Array, observation: Observation, psf_shape: Sequence[int]) -> int:
     """Return the side of the window in which PSFs of a shape are judged, pixels of the images."""
-    side = WINDOW
+    side, q = WINDOW, observation.oversample
     while side > LEAST_WINDOW:
-        of_psf = math.prod(min(n, side * observation.oversample) for n in psf_shape)
-        if np.count_nonzero(find_window(stars, observation, side)[2]) * of_psf <= MOST_PIXELS:
+        of_psf = math.prod(min(n, side * q) for n in psf_shape)
+        held = find_window(stars, observation, side)[2]
+        is_slow = np.count_nonzero(held) * of_psf > MOST_PIXELS
+        if not (is_slow or _is_wide(side // 2, max(psf_shape) / q, stars[held], observation)):
             break
         side //= 2
     return side
+
+
+def _is_wide(side: int, width: float, stars: Array, observation: Observation) -> bool:
+    """Return whether a window holds stars, and round each as much of its image as a PSF is wide."""
+    cut, first, held = find_window(stars, observation, side)
+    if 2 * width > side or not held.all():
+        return False
+    last, end = first + cut.shape[::-1] - 1, np.array(observation.shape[::-1]) - 1
+    places = np.array([observation.places(j, stars) for j in range(observation.n_images)])
+    is_near = ((first > 0) & (places < first + width)) | ((last < end) & (places > last - width))
+    is_seen = (places > -width) & (places < end + width)
+    return not (is_near.any(axis=-1) & is_seen.all(axis=-1)).any()
 
 
 def find_window(
