@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from itertools import product
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import ndimage
 
 from lnocl.core.scene.arrays import Array, Mask
 from lnocl.core.scene.cores import core
+from lnocl.core.scene.remembered import remembered
 from lnocl.core.scene.shifting import ENDLESS, MovablePsf
 
 # The pairs of pixels on both sides of one: beside it, above and below, and across.
@@ -75,12 +78,18 @@ def _sharp(
     while True:
         is_known = ~(bad | sharp) & np.isfinite(noise)
         variance = np.where(is_known, noise, 0.0) ** 2 + (light if are_counts else 0.0)
-        new = np.zeros(bad.shape, bool)
+        # Of others not even dark neighbours would tell.
+        at = np.nonzero(is_known & (light > CLEAR * np.sqrt(variance)))
+        of_light, of_variance, of_known = (np.pad(each, 1) for each in (light, variance, is_known))
+        is_sharp = np.zeros(len(at[0]), bool)
         for direction, share in zip(DIRECTIONS, shares, strict=True):
-            pair, expected = _beside(light, direction), share * light
-            error = np.sqrt(_beside(variance, direction) + share**2 * variance)
-            are_known = is_known & (_beside(is_known.astype(float), direction) == 2)
-            new |= are_known & (pair < SHARE * expected) & (expected - pair > CLEAR * error)
+            pair, expected = _pair(of_light, at, direction), share * light[at]
+            pair_variance = _pair(of_variance, at, direction)
+            error = np.sqrt(pair_variance + share**2 * variance[at])
+            are_known = _pair(of_known.astype(np.int8), at, direction) == 2
+            is_sharp |= are_known & (pair < SHARE * expected) & (expected - pair > CLEAR * error)
+        new = np.zeros(bad.shape, bool)
+        new[at] = is_sharp
         new &= ~but(new)
         if not new.any():
             return sharp
@@ -133,20 +142,24 @@ def _lobes(psf: Array, most: int) -> Array:
     return beyond[middle - half : middle + half + 1, middle - half : middle + half + 1]
 
 
-def _beside(values: Array, direction: tuple[int, int]) -> Array:
-    """Return the sum of the two pixels on both sides of each along a direction."""
-    (ny, nx), (dy, dx) = values.shape, direction
-    padded = np.pad(values, 1)
-    after = padded[1 + dy : 1 + dy + ny, 1 + dx : 1 + dx + nx]
-    return np.asarray(after + padded[1 - dy : 1 - dy + ny, 1 - dx : 1 - dx + nx])
+def _pair(
+    padded: NDArray[Any], at: tuple[NDArray[np.intp], ...], direction: tuple[int, int]
+) -> NDArray[Any]:
+    """Return the sums of the two pixels on both sides of some along a direction.
+
+    `padded` has a pixel more at each edge than where `at` are the rows and columns.
+    """
+    (y, x), (dy, dx) = at, direction
+    return np.asarray(padded[y + 1 + dy, x + 1 + dx] + padded[y + 1 - dy, x + 1 - dx])
 
 
+@remembered(2**17)  # each star asks for that of its PSF
 def _least_shares(psf: Array) -> Array:
     """Return the least share of its brightest pixel that a star has beside it, by direction."""
-    movable, shares = MovablePsf(psf, ENDLESS), []
+    movable, shares, middle = MovablePsf(psf, ENDLESS), [], (np.zeros(1, int), np.zeros(1, int))
     for y, x in product(PLACES, PLACES):
         star = movable.at(x, y).add_to(np.zeros((3, 3)), (-1, -1), ENDLESS)
-        shares.append([_beside(star, each)[1, 1] / star[1, 1] for each in DIRECTIONS])
+        shares.append([_pair(star, middle, each)[0] / star[1, 1] for each in DIRECTIONS])
     return np.min(shares, axis=0).clip(0.0)
 
 

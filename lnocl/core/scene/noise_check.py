@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from lnocl.core.scene.arrays import Array
+from lnocl.core.scene.arrays import Array, Mask
 from lnocl.core.scene.observation import Observation
+from lnocl.core.scene.remembered import remembered
 from lnocl.errors import warn
 
 # Noise is measured in square blocks, of these the darker half, where there are so many.
@@ -66,7 +67,7 @@ def measure_noise(observation: Observation) -> Iterator[Noise | None]:
     yield from map(noise_of, *zip(*each, strict=True))
 
 
-def noise_of(image: Array, mask: NDArray[np.bool_], background: Array | float) -> Noise | None:
+def noise_of(image: Array, mask: Mask, background: Array | float) -> Noise | None:
     """Return the noise of an image; None where too few blocks are free of bad pixels.
 
     Parameters
@@ -77,12 +78,17 @@ def noise_of(image: Array, mask: NDArray[np.bool_], background: Array | float) -
         Electrons per pixel.
     """
     ny, nx = (n - n % BLOCK for n in image.shape)
-    image, bad, background = (
-        _some_rows(np.broadcast_to(each, image.shape)[:ny, :nx])
-        for each in (np.where(mask, 0.0, image), mask.astype(np.float64), background)
-    )
+    image, mask = _some_rows(image[:ny, :nx]), _some_rows(mask[:ny, :nx])
+    level = np.asarray(background)
+    level = _some_rows(level[:ny, :nx]) if level.ndim else level
+    return _noise_of_blocks(np.where(mask, 0.0, image), mask, level)
+
+
+@remembered(2**16)  # each step of the preparation asks for that of its images
+def _noise_of_blocks(image: Array, mask: Mask, background: Array) -> Noise | None:
+    """Return the noise of an image of whole blocks, 0 where a pixel is bad."""
     means = _block_means(image)
-    good = _block_means(bad) == 0
+    good = _block_means(mask.astype(np.float64)) == 0
     if good.sum() < 2 * MIN_BLOCKS:
         return None
     dark = good & (means <= np.median(means[good]))
@@ -114,7 +120,7 @@ def with_noise_shown(observation: Observation) -> Observation:
     return observation.replace(images=images, background=background - excess)
 
 
-def _some_rows(pixels: Array) -> Array:
+def _some_rows(pixels: NDArray[Any]) -> NDArray[Any]:
     """Return all rows of blocks, or every so many-th of more than `MAX_ROWS`."""
     ny, nx = pixels.shape
     some = pixels.reshape(ny // BLOCK, BLOCK, nx)[:: ny // (BLOCK * MAX_ROWS) or 1]

@@ -45,7 +45,7 @@ NEAREST, FARTHEST, STEPS = 0.5, 3.0, 2.0
 # there, as of detections; each of its steps is so many pixels at most.
 SIGNIFICANT, CLEAR, MOVED, N_STEPS = 5.0, 3.0, 1.0, 2
 # The share of the gradient at which conjugate gradients end, and the information of what is free.
-FINISHED, FREE = 1e-3, 1e-9
+FINISHED, FREE = 1e-2, 1e-9
 
 
 class Companion(NamedTuple):
