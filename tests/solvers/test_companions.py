@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import lnocl
-from lnocl.core.runs.companions import beside_stars
 from lnocl.core.runs.guarded_runs import GuardedRuns
+from lnocl.core.runs.psf_refinement import mend
 from lnocl.core.runs.start import Setup
 from lnocl.core.scene.estimate import Estimate
 from lnocl.core.scene.forward_model import Model
@@ -183,15 +183,19 @@ def test_a_companion_that_is_not_named_stays_out_of_the_psf(caplog):
 
 @pytest.mark.exhaustive
 def test_points_are_looked_for_through_psfs_without_the_noise_of_their_wings(monkeypatch):
-    observation, seen = observe(), []
+    observation, seen = observe().replace(psf_error=0.03), []
     noise = 2e-4 * np.random.default_rng(2).standard_normal(observation.psfs.shape)
     noisy = observation.replace(psfs=observation.psfs + noise)
-    monkeypatch.setattr(
-        GuardedRuns, "setup_of", lambda runs, psfs, _: seen.append(psfs) or runs._setup
-    )
+
+    def run(_, psfs, stars):
+        seen.append(psfs)
+        raise StopIteration
+
+    monkeypatch.setattr(GuardedRuns, "steady", run)
     for each in (observation, noisy):
         setup = Setup(each, np.array([STAR]), 0, "sgp", "double", "numpy", None)
-        beside_stars(GuardedRuns(setup))
+        with pytest.raises(StopIteration):
+            mend(GuardedRuns(setup), ("jitter",), False, False)
     np.testing.assert_array_equal(seen[0], observation.psfs)
     assert noisy.psfs.min() < -1e-4
     assert seen[1].min() >= 0

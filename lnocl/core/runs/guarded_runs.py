@@ -99,23 +99,22 @@ class GuardedRuns:
         The images in the window, without their PSFs; their noise is that of the whole images.
     stars : ndarray of float64, shape (n, 2)
         The positions of the stars in the window, from its first pixel.
+    first : ndarray of int, shape (2,)
+        That pixel in the whole images.
     held : ndarray of bool, shape (m,)
         Which of all m stars these are.
-    all_stars : ndarray of float64, shape (m, 2)
-        The positions of all stars in the whole images.
     penalty : Penalty
         Of runs that are not smoothed more strongly near stars.
     """
 
     def __init__(self, setup: Setup, tick: Callable[[], object] = int) -> None:
         self.whole, self._tick, observation = setup, tick, setup.observation
-        self.all_stars = setup.stars
         # PSFs that are cut to the window go without what has the shape of whole ones.
         shown = with_noise_shown(observation).replace(**dict.fromkeys(BESIDE_PSFS))
         self._side = choose_window(setup.stars, shown, observation.psfs.shape[1:])
         window = find_window(setup.stars, shown, self._side)
-        self.observation, self._first, self.held = window
-        self.stars = setup.stars[self.held] - self._first
+        self.observation, self.first, self.held = window
+        self.stars = setup.stars[self.held] - self.first
         if len(own := self.observation.star_psfs):
             cut = np.array([self.cut(psfs) for psfs in own])
             self.observation = self.observation.replace(star_psfs=cut)
@@ -125,7 +124,12 @@ class GuardedRuns:
             setup, solver="sgp", pad=pad, initial_extended=None, initial_star_fluxes=None
         )
         self.penalty = Penalty(smoothing=STEADY * recommend_smoothing(self.observation))
-        self._steady = list[tuple[Estimate, Psfs, Array]]()
+        self._steady = dict[tuple[int, bytes], tuple[Estimate, Psfs]]()
+
+    def beside(self, points: Array) -> GuardedRuns:
+        """Return the runs with more stars, at places (n, 2) in the whole images."""
+        stars = np.concatenate([self.whole.stars, points])
+        return GuardedRuns(replace(self.whole, stars=stars), self._tick)
 
     def setup_of(self, psfs: Psfs, stars: Array) -> Setup:
         """Return the setup of a run with PSFs of the whole images and stars of the window."""
@@ -179,12 +183,11 @@ class GuardedRuns:
         DivergedError, NotFiniteError
             As `run_steadily`.
         """
-        for found, of_psfs, of_stars in self._steady:
-            if of_psfs is psfs and np.array_equal(of_stars, stars):
-                return found
-        found = steady_estimate(self.setup_of(psfs, stars), self.penalty, self._tick)
-        self._steady = [(found, psfs, stars)]
-        return found
+        key = id(psfs), stars.tobytes()
+        if key not in self._steady:  # which holds the PSFs, lest others take their place in memory
+            found = steady_estimate(self.setup_of(psfs, stars), self.penalty, self._tick)
+            self._steady = {key: (found, psfs)}
+        return self._steady[key][0]
 
     def settled(self, psfs: Psfs, stars: Array, moves: bool) -> tuple[Psfs, Array, Array]:
         """Return PSFs, of the whole images, and stars, in the window, as the images show them.
@@ -243,7 +246,7 @@ class GuardedRuns:
         """Return the window with PSFs of the whole images, cut to it."""
         cut = mapped(psfs, lambda _, stack: self.cut(stack))
         if isinstance(cut, tuple):
-            x, y = self._first
+            x, y = self.first
             cut = tuple(field.moved(-x, -y) for field in cut)
         return self.observation.replace(psfs=cut)
 

@@ -114,13 +114,11 @@ def _mend_images(plan: Plan) -> tuple[Setup, dict[str, str]]:
 def _judge_psfs(plan: Plan, setup: Setup, progress: bool) -> Mended:
     """Return that of `lnocl.core.runs.psf_refinement.mend`, or `setup` where it is not finite.
 
-    Points beside the stars, which PSFs that may have an error would follow, are held meanwhile.
     The scatter of such PSFs is one of the unknowns at the stars: they fit unless residuals show
     otherwise. Exact ones are wrong by the scatter that is given.
     """
-    from lnocl.core.runs.companions import beside_stars  # which loads scipy
-    from lnocl.core.runs.guarded_runs import GuardedRuns
-    from lnocl.core.runs.psf_refinement import MOST_STARS, mend
+    from lnocl.core.runs.guarded_runs import GuardedRuns  # which loads scipy
+    from lnocl.core.runs.psf_refinement import mend
 
     known, judged = setup.observation.psf_scatter, setup
     if setup.observation.psf_error and len(known):
@@ -129,12 +127,7 @@ def _judge_psfs(plan: Plan, setup: Setup, progress: bool) -> Mended:
     judging = Progress(None, "it", bool(progress), "judging the PSFs", stays=False)
     with judging, suppress(NotFiniteError):  # of which the run itself tells
         runs = GuardedRuns(judged, judging.update)
-        may_hide = plan.families and setup.observation.psf_error and len(setup.stars) <= MOST_STARS
-        if may_hide and len(points := beside_stars(runs)):
-            held = replace(judged, stars=np.concatenate([setup.stars, points]))
-            runs = GuardedRuns(held, judging.update)
         mended = mend(runs, plan.families, plan.moves, plan.is_asked)
-        mended = mended._replace(setup=replace(mended.setup, stars=setup.stars))
     if judged is setup:
         return mended
     observation = mended.setup.observation

@@ -51,7 +51,7 @@ class Allowance:
         misfit = estimate.misfit
         self._observation, self._estimate, self._held = observation, estimate, runs.held
         self._moved = estimate.scene.places - runs.stars
-        self._stars = runs.all_stars
+        self._stars = runs.whole.stars
         self.error = misfit.kappa if misfit.is_significant else 0.0
         # Those that are told, and those that the smoothing follows.
         shares = np.array([misfit.in_rings * bool(self.error), misfit.in_rings])

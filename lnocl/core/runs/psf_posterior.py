@@ -22,7 +22,7 @@ from lnocl.core.scene.cores import fwhm
 from lnocl.core.scene.estimate import Estimate
 from lnocl.core.scene.penalty import Penalty
 from lnocl.core.solvers.least_squares import Field, LeastSquares, LinearImage
-from lnocl.core.solvers.near_star import N_STEPS, NearStar, Surroundings
+from lnocl.core.solvers.near_star import N_STEPS, NearStar, Surroundings, brightest
 from lnocl.core.solvers.psf_errors import (
     N_SHAPES,
     N_SLOPES,
@@ -35,8 +35,6 @@ from lnocl.core.solvers.psf_errors import (
 from lnocl.errors import DivergedError, NotFiniteError
 from lnocl.process import ignored_notes, ignored_warnings
 
-# So many of the brightest stars tell of the PSFs.
-MOST_STARS = 4
 # Rounds of a run and of a step, at most, and the longest step, and that after which none follows,
 # standard deviations of the prior: the third would be a third of it (docs/validation/psf_error.md).
 ROUNDS, MAX_STEP, SHORT = 3, 6.0, 0.3
@@ -108,13 +106,9 @@ def _mean(estimate: Estimate, at: Array, moves: bool) -> tuple[Array, Array]:
     scene, n_psfs = estimate.scene, len(at)
     around, n_epochs = Surroundings(estimate, moves), scene.n_epochs
     away = np.zeros((scene.n_stars // n_epochs, 2))
-    light = np.where(scene.owned < 0, estimate.star_fluxes[: scene.n_stars], 0.0)
-    light = light.reshape(-1, n_epochs).sum(axis=1)
-    brightest = np.argsort(-light, kind="stable")[:MOST_STARS]
-    brightest = n_epochs * brightest[light[brightest] > 0]
-    if not len(brightest):
+    nears = [NearStar(around, star, FINISHED) for star in brightest(estimate, scene.owned < 0)]
+    if not nears:
         return at, away
-    nears = [NearStar(around, star, FINISHED) for star in brightest.tolist()]
     nears = [near for near in nears if near.window.shape == nears[0].window.shape]
     owns = np.cumsum([0, *(near.n for near in nears)])
     images, fields, p = list[LinearImage](), list[Field](), scene.n_images

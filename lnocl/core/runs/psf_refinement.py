@@ -8,6 +8,7 @@ the extended source is smoothed near the stars because of what could not be mend
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -34,8 +35,10 @@ from lnocl.core.scene.psf_misfit import PsfMisfit
 from lnocl.core.scene.psf_wings import are_noisy, without_noise
 from lnocl.core.scene.psfs import MOST_PSF_ERROR
 from lnocl.core.scene.star_psfs import owned
+from lnocl.core.solvers.companions import Companion, companions
 from lnocl.core.solvers.psf_fit import step
-from lnocl.errors import counted, note, warn
+from lnocl.errors import DivergedError, NotFiniteError, counted, note, warn
+from lnocl.process import ignored_notes, ignored_warnings
 
 # A mend is taken where it leaves less than this share of kappa, or nothing to doubt, and a misfit
 # that is less by so many of its standard deviations.
@@ -107,6 +110,7 @@ class _State:
 def mend(runs: GuardedRuns, names: Sequence[str], moves: bool | str, is_asked: bool) -> Mended:
     """Return a setup whose positions and PSFs are mended where the images ask for it.
 
+    Points beside the stars, which PSFs that may have an error would follow, are held meanwhile.
     The noise of PSFs that have negative pixels, but for exact ones that fit, is taken from their
     wings first, unless they fit worse so. PSFs that may have an error then become the
     mean of what the stars show of it (`lnocl.core.runs.psf_posterior`), unless they are in doubt
@@ -134,6 +138,9 @@ def mend(runs: GuardedRuns, names: Sequence[str], moves: bool | str, is_asked: b
         Whether the outcome is wanted though PSFs may fit.
     """
     setup, observation = runs.whole, runs.whole.observation
+    may_hide = names and observation.psf_error and len(setup.stars) <= MOST_STARS
+    if may_hide and len(points := _beside_stars(runs)):
+        runs = runs.beside(points)
     if len(runs.stars) > MOST_STARS and not (is_asked or len(observation.psf_scatter)):
         number = counted(len(runs.stars), "star")
         note(f"PSFs are not judged: {number} in the window; name `refine_psfs` to judge them")
@@ -150,7 +157,8 @@ def mend(runs: GuardedRuns, names: Sequence[str], moves: bool | str, is_asked: b
             _tell_widths(observation.replace(psfs=state.psfs), settled.psfs)
         given, state = (settled if state is given else given), settled
     if state.misfit.is_doubtful and moves == "auto":
-        state = _move(runs, state)
+        moved = _State.of(runs, state.psfs, runs.stars, True)
+        state = moved if state.is_mended_by(moved) else state
     if not is_asked and _is_held(state.misfit, observation):
         names = [name for name in names if name not in TAKING]
     of_parameters = [name for name in names if name != "pixels"]
@@ -162,9 +170,12 @@ def mend(runs: GuardedRuns, names: Sequence[str], moves: bool | str, is_asked: b
         if is_fitted := state.is_mended_by(tried):
             state = tried
             done.append(f"{' and '.join(of_parameters)} fitted")
-    if state.misfit.is_doubtful and _shows_pixels(state.misfit) and "pixels" in names:
+    # Below either, pixels follow the noise.
+    may_free = state.misfit.is_significant or state.misfit.kappa > FREED
+    if state.misfit.is_doubtful and may_free and "pixels" in names:
         fitted, first = tried, min(state, tried, key=lambda each: each.misfit.kappa)
-        loose = _loosen(runs, first)
+        # A source that is kept from the stars more strongly leaves its own errors to the pixels.
+        loose = _State.of(runs, first.psfs, first.places, first.moves, guard=STRENGTH)
         tried = _free_pixels(runs, observation.psf_scatter, loose, moves is not False)
         if _is_trusted(tried, loose, state.misfit.kappa):
             left, state, is_fitted = state.misfit, tried, first is fitted
@@ -177,8 +188,8 @@ def mend(runs: GuardedRuns, names: Sequence[str], moves: bool | str, is_asked: b
     estimate = replace(state.estimate, misfit=left or state.misfit)
     allowance = Allowance(observation, runs, estimate, known)
     near_stars = allowance.near_stars(setup.pad)
+    changed = replace(setup, observation=observation, refine_positions=state.moves)
     if not (is_asked or len(known) or is_told):
-        changed = replace(setup, observation=observation, refine_positions=state.moves)
         return Mended(changed, None, near_stars, True, True)
     _tell(given, state, tried, done)
     refinement = PsfRefinement(
@@ -202,7 +213,7 @@ def mend(runs: GuardedRuns, names: Sequence[str], moves: bool | str, is_asked: b
     if observation.psf_error and not is_within:  # the errors of stars hold what residuals show
         raised = min(estimate.misfit.kappa, MOST_PSF_ERROR)
         observation = observation.replace(psf_error=raised)
-    changed = replace(setup, observation=observation, refine_positions=state.moves)
+    changed = replace(changed, observation=observation)
     return Mended(changed, refinement, near_stars, fits, is_within)
 
 
@@ -212,9 +223,25 @@ def _is_held(misfit: PsfMisfit, observation: Observation) -> bool:
     return bool(error) and misfit.kappa <= HELD * error
 
 
-def _shows_pixels(misfit: PsfMisfit) -> bool:
-    """Return whether a misfit is enough for free pixels, which else follow the noise."""
-    return misfit.is_significant or misfit.kappa > FREED
+def _beside_stars(runs: GuardedRuns) -> Array:
+    """Return the places of points that a run of the window shows beside stars, shape (n, 2).
+
+    They are those of `lnocl.core.solvers.companions`, (x, y), pixels of the images: PSFs that may
+    have an error would follow them. The noise of wings, which may look like one, is taken from
+    the PSFs.
+    """
+    found, observation = list[Companion](), runs.whole.observation
+    psfs = observation.psfs_over_images
+    if are_noisy(observation.psfs):
+        psfs = _without_noise(psfs, observation)
+    with suppress(DivergedError, NotFiniteError), ignored_warnings(), ignored_notes():
+        _, found = companions(runs.steady(psfs, runs.stars))
+    places = runs.first + np.reshape([each.place for each in found], (-1, 2))
+    if len(places):
+        named = " ".join(f"({x:.4g}, {y:.4g})" for x, y in places)
+        number = counted(len(places), "point")
+        note(f"{number} beside stars held while PSFs are fitted, {named}: name what is a star")
+    return np.asarray(places, np.float64)
 
 
 def _settle(runs: GuardedRuns, state: _State, moves: bool) -> _State:
@@ -234,23 +261,20 @@ def _settle(runs: GuardedRuns, state: _State, moves: bool) -> _State:
     return state if is_worse or is_faded else settled
 
 
-def _move(runs: GuardedRuns, state: _State) -> _State:
-    """Return the state with the stars where they fit best, where that mends it."""
-    moved = _State.of(runs, state.psfs, runs.stars, True)
-    return moved if state.is_mended_by(moved) else state
-
-
 def _clean(runs: GuardedRuns, state: _State) -> _State:
     """Return the state with the noise taken from the wings of PSFs, unless they fit worse so.
 
     Noise of wings hands the light of stars to the extended source, which it spreads, and nothing of
     that shows at the stars.
     """
-    q = runs.observation.oversample
-    psfs = mapped(state.psfs, lambda _, stack: without_noise(stack, q))
+    psfs = _without_noise(state.psfs, runs.observation)
     cleaned = _State.of(runs, psfs, state.places, state.moves)
     is_worse = cleaned.misfit.significance > state.misfit.significance + GONE
     return state if is_worse else cleaned
+
+
+def _without_noise(psfs: Psfs, observation: Observation) -> Psfs:
+    return mapped(psfs, lambda _, stack: without_noise(stack, observation.oversample))
 
 
 def _fit(
@@ -269,14 +293,6 @@ def _fit(
         if again[1].misfit.reduced < fitted.misfit.reduced:
             parameters, fitted = again
     return fitted, parameters.values
-
-
-def _loosen(runs: GuardedRuns, state: _State) -> _State:
-    """Return the state with an extended source that is smoothed as in the reconstruction.
-
-    One that is kept from the stars more strongly leaves its own errors to pixels that are free.
-    """
-    return _State.of(runs, state.psfs, state.places, state.moves, guard=STRENGTH)
 
 
 def _free_pixels(runs: GuardedRuns, scatter: Array, state: _State, moves: bool) -> _State:

@@ -15,6 +15,8 @@ from lnocl.core.scene.cores import core
 from lnocl.core.scene.remembered import remembered
 from lnocl.core.scene.shifting import ENDLESS, MovablePsf
 
+# Rows and columns.
+Places = tuple[NDArray[np.intp], NDArray[np.intp]]
 # The pairs of pixels on both sides of one: beside it, above and below, and across.
 DIRECTIONS = ((0, 1), (1, 0), (1, 1), (1, -1))
 # The pixels beside a cosmic ray have less than this share of a star's light there, by so many
@@ -81,12 +83,13 @@ def _sharp(
         # Of others not even dark neighbours would tell.
         at = np.nonzero(is_known & (light > CLEAR * np.sqrt(variance)))
         of_light, of_variance, of_known = (np.pad(each, 1) for each in (light, variance, is_known))
+        inside = at[0] + 1, at[1] + 1
         is_sharp = np.zeros(len(at[0]), bool)
         for direction, share in zip(DIRECTIONS, shares, strict=True):
-            pair, expected = _pair(of_light, at, direction), share * light[at]
-            pair_variance = _pair(of_variance, at, direction)
+            pair, expected = _pair(of_light, inside, direction), share * light[at]
+            pair_variance = _pair(of_variance, inside, direction)
             error = np.sqrt(pair_variance + share**2 * variance[at])
-            are_known = _pair(of_known.astype(np.int8), at, direction) == 2
+            are_known = _pair(of_known.astype(np.int8), inside, direction) == 2
             is_sharp |= are_known & (pair < SHARE * expected) & (expected - pair > CLEAR * error)
         new = np.zeros(bad.shape, bool)
         new[at] = is_sharp
@@ -142,24 +145,19 @@ def _lobes(psf: Array, most: int) -> Array:
     return beyond[middle - half : middle + half + 1, middle - half : middle + half + 1]
 
 
-def _pair(
-    padded: NDArray[Any], at: tuple[NDArray[np.intp], ...], direction: tuple[int, int]
-) -> NDArray[Any]:
-    """Return the sums of the two pixels on both sides of some along a direction.
-
-    `padded` has a pixel more at each edge than where `at` are the rows and columns.
-    """
+def _pair(padded: NDArray[Any], at: Places, direction: tuple[int, int]) -> NDArray[Any]:
+    """Return the sums of the two pixels on both sides of some along a direction."""
     (y, x), (dy, dx) = at, direction
-    return np.asarray(padded[y + 1 + dy, x + 1 + dx] + padded[y + 1 - dy, x + 1 - dx])
+    return np.asarray(padded[y + dy, x + dx] + padded[y - dy, x - dx])
 
 
 @remembered(2**17)  # each star asks for that of its PSF
 def _least_shares(psf: Array) -> Array:
     """Return the least share of its brightest pixel that a star has beside it, by direction."""
-    movable, shares, middle = MovablePsf(psf, ENDLESS), [], (np.zeros(1, int), np.zeros(1, int))
+    movable, shares, at = MovablePsf(psf, ENDLESS), [], (np.array([1]), np.array([1]))
     for y, x in product(PLACES, PLACES):
         star = movable.at(x, y).add_to(np.zeros((3, 3)), (-1, -1), ENDLESS)
-        shares.append([_pair(star, middle, each)[0] / star[1, 1] for each in DIRECTIONS])
+        shares.append([_pair(star, at, each)[0] / star[1, 1] for each in DIRECTIONS])
     return np.min(shares, axis=0).clip(0.0)
 
 

@@ -402,14 +402,8 @@ class Windows:
         """Return the sum of the adjoints, each applied to its image."""
         totals: dict[Hashable, tuple[LinearMap, Spectrum]] = {}
         for members, each in zip(self._cuts, self._joint, strict=True):
-            # What a flux of one epoch changes is dark in all others.
-            lit = [j for j in members if images[j].any()]
-            if len(lit) == len(members) > 1:
-                back = each.back(np.array([images[j] for j in lit])).sum(axis=0)
-            elif lit or not totals:
-                back = sum(self._maps[j].back(images[j]) for j in lit or members[:1])
-            else:
-                continue
+            seen = [images[j] for j in members]
+            back = each.back(np.array(seen)).sum(axis=0) if len(seen) > 1 else each.back(seen[0])
             _, so_far = totals.get(each.key, (each, 0.0))
             totals[each.key] = each, back + so_far
         return np.asarray(sum(each.sky(total) for each, total in totals.values()))

@@ -33,11 +33,11 @@ from lnocl.core.scene.psfs import PSF_ERROR
 from lnocl.core.scene.texture import Texture
 from lnocl.core.solvers.fluxes import variances
 from lnocl.core.solvers.least_squares import ROUNDING, LinearImage
-from lnocl.core.solvers.near_star import NearStar, Surroundings, offsets_from
+from lnocl.core.solvers.near_star import NearStar, Surroundings, brightest, offsets_from
 from lnocl.core.solvers.psf_errors import CORRELATED, NARROWEST
 
-# So many of the brightest stars are looked at, and so many points are found, at most.
-MOST_STARS, MOST_POINTS = 4, 3
+# So many points are found, at most.
+MOST_POINTS = 3
 # Points are tried at these distances from a star, resolutions, so many to one at first: nearer ones
 # are part of it, and of those farther off a PSF takes no light (docs/validation/psf_error.md).
 NEAREST, FARTHEST, STEPS = 0.5, 3.0, 2.0
@@ -94,7 +94,7 @@ def companions(
     width = Surroundings(estimate, False).width
     if width < NARROWEST:  # samples do not hold its shape
         return beside, found
-    stars = _brightest(estimate)
+    stars = brightest(estimate)
     while stars and len(found) < MOST_POINTS:
         around = Surroundings(beside, False, raised)
         likeliest = max((_likeliest(around, star) for star in stars), key=lambda each: each[-1])
@@ -130,7 +130,7 @@ def errors_beside(estimate: Estimate, raised: Array | None = None) -> Array:
     around = Surroundings(estimate, False, raised)
     if around.width < NARROWEST:
         return errors
-    for star in _brightest(estimate):
+    for star in brightest(estimate):
         near = NearStar(around, star, FINISHED)
         distance, is_tried = _places(around, near, star)
         at = np.nonzero(is_tried)
@@ -152,14 +152,6 @@ def _doubted(estimate: Estimate) -> Estimate:
     error = max(error, PSF_ERROR) if error else 0.0
     scene.observation = scene.observation.replace(psf_error=error)
     return Estimate(scene, estimate.sky, estimate.star_fluxes)
-
-
-def _brightest(estimate: Estimate) -> list[int]:
-    """Return the first epochs of the brightest stars."""
-    scene = estimate.scene
-    light = estimate.star_fluxes[: scene.n_stars].reshape(-1, scene.n_epochs).sum(axis=1)
-    brightest = np.argsort(-light, kind="stable")[:MOST_STARS]
-    return [int(scene.n_epochs * star) for star in brightest if light[star] > 0]
 
 
 def _places(around: Surroundings, near: NearStar, star: int) -> tuple[Array, Mask]:

@@ -55,6 +55,8 @@ DEVIATION = VARIANCE**0.5
 HELD = 1e12
 # Steps of conjugate gradients at most.
 N_STEPS = 2000
+# So many of the brightest stars tell of the PSFs, and are looked at for companions.
+MOST_STARS = 4
 
 
 class Surroundings:
@@ -290,6 +292,14 @@ class NearStar:
             enlarged(image.left, shape) - beyond,
             enlarged(image.precision, shape),
         )
+
+
+def brightest(estimate: Estimate, is_meant: NDArray[np.bool_] | bool = True) -> list[int]:
+    """Return the first epochs of the `MOST_STARS` brightest stars, or of those that are meant."""
+    n_stars, n_epochs = estimate.scene.n_stars, estimate.scene.n_epochs
+    light = np.where(is_meant, estimate.star_fluxes[:n_stars], 0.0).reshape(-1, n_epochs).sum(1)
+    order = np.argsort(-light, kind="stable")[:MOST_STARS]
+    return (n_epochs * order[light[order] > 0]).tolist()
 
 
 def offsets_from(scene: Scene, star: int, window: Window) -> tuple[Array, Array]:
