@@ -1,6 +1,7 @@
 """PSFs that are not as given: what stars show of them is used, and the rest is in the errors."""
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from lnocl.core.runs.guarded_runs import GuardedRuns
 from lnocl.core.runs.outcome import PsfRefinement
 from lnocl.core.runs.psf_refinement import mend
 from lnocl.core.runs.start import Setup
+from lnocl.core.runs.steady import steady_estimate
 from lnocl.core.scene.cores import fwhm
 from lnocl.core.scene.penalty import Penalty, recommend_smoothing
 from lnocl.core.solvers.psf_errors import with_errors
@@ -177,7 +179,8 @@ def test_a_file_that_ends_early_leaves_the_light_beyond_in_the_error():
 
 def settle(observation, stars=(STAR,)):
     penalty = Penalty(smoothing=recommend_smoothing(observation))
-    steps, places = psf_posterior.settle_psfs(setup_of(observation, stars), penalty, False)
+    run = partial(steady_estimate, penalty=penalty)
+    steps, places = psf_posterior.settle_psfs(setup_of(observation, stars), False, run)
     np.testing.assert_array_equal(places, stars)
     return steps
 
@@ -220,7 +223,8 @@ def test_stars_are_moved_that_lie_off_where_psfs_are_fitted(shift):
     observation = lnocl.Observation(image, psf(3.4), background=4e4, psf_error=0.03)
     given = STAR[0] + shift, STAR[1] - shift
     penalty = Penalty(smoothing=3 * recommend_smoothing(observation))
-    _, places = psf_posterior.settle_psfs(setup_of(observation, [given]), penalty, True)
+    run = partial(steady_estimate, penalty=penalty)
+    _, places = psf_posterior.settle_psfs(setup_of(observation, [given]), True, run)
     assert places[0] == pytest.approx(STAR if shift > 0.1 else given, abs=0.06)
     found = mend(GuardedRuns(setup_of(observation, [given])), ("jitter",), False, False)
     assert not found.setup.refine_positions

@@ -129,17 +129,19 @@ def test_fluxes_are_those_of_least_squares_with_all_unknowns():
     point = np.zeros(near.expected.shape)
     point[y, x] = 1.0
     n, rows, right = len(near.prior), [], []
-    pixels = near.fields[2].scatter
+    pixels, prior = near.fields[1].scatter, near.prior.copy()
+    prior[near.level, near.level] = 0.0  # it may be any
     whole = near.source.images_of(near.expected + estimate.part(near.places(estimate.scene)))
-    each = zip(near.images, pixels, near.source.images_of(point), whole, DEPTHS, strict=True)
-    for image, scatter, seen, extended, depth in each:
-        columns = np.zeros((n + 2, image.left.size))
-        columns[image.unknowns], columns[n], columns[n + 1] = image.slopes, depth, seen.ravel()
+    for image, scatter, seen, extended in zip(
+        near.images, pixels, near.source.images_of(point), whole, strict=True
+    ):
+        columns = np.zeros((n + 1, image.left.size))
+        columns[image.unknowns], columns[n] = image.slopes, seen.ravel()
         variance = 1 / image.precision + 2 * np.pi * (CORRELATED * scatter) ** 2
         rows.append(columns / np.sqrt(variance).ravel())
         right.append(((image.left + extended) / np.sqrt(variance)).ravel())
-    roots = np.zeros((n + 2, n))
-    roots[:n] = np.linalg.cholesky(near.prior + 1e-14 * np.eye(n))
+    roots = np.zeros((n + 1, n))
+    roots[:n] = np.linalg.cholesky(prior + 1e-14 * np.eye(n))
     matrix = np.concatenate([*rows, roots], axis=1).T
     values = np.concatenate([*right, np.zeros(n)])
     solved = np.linalg.lstsq(matrix, values, rcond=None)[0]

@@ -66,8 +66,8 @@ def dense(near):
         information += (rows * image.precision.ravel()) @ rows.T
         moments += rows @ (image.precision * image.left).ravel()
     of_source = np.zeros(total, bool)
-    of_source[n : n + sizes[0] + sizes[1]] = True
-    of_source[1:2] = True  # the cusp
+    of_source[n : n + sizes[0]] = True
+    of_source[1:3] = True  # the level and the cusp
     known = np.ix_(~of_source, ~of_source)
     return (
         np.linalg.inv(information)[0, 0],

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from lnocl.core.solvers import least_squares
-from lnocl.core.solvers.least_squares import LeastSquares, LevelError, LinearImage
+from lnocl.core.solvers.least_squares import LeastSquares, LinearImage
 
 SCRIPT = """
 import hashlib
@@ -46,14 +46,6 @@ def test_threads_of_blas_change_no_bit():
     }
     assert len(found) == 1
     assert len(found.pop().splitlines()) == 3
-
-
-def test_a_level_is_the_transpose_of_its_effect():
-    rng = np.random.default_rng(2)
-    level = LevelError(0.7, np.array([1.5, 0.4, 2.0])[:, None, None], (6, 9))
-    images = rng.standard_normal((3, 6, 9))
-    forward = (level.forward(np.array([1.3])) * images).sum()
-    assert forward == pytest.approx(1.3 * level.adjoint(images)[0], rel=1e-13)
 
 
 SIDE = 12

@@ -13,7 +13,7 @@ import math
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -195,11 +195,17 @@ class GuardedRuns:
         Those given are returned where they stay. Stars stay unless they may move. The third is the
         fluxes of the stars through the PSFs given, electrons; none where they stay.
         """
-        setup, first = self.setup_of(psfs, stars), partial(self.steady, psfs, stars)
-        steps, found = settle_psfs(setup, self.penalty, moves, self._tick, first)
+        setup = self.setup_of(psfs, stars)
+
+        def run(given: Setup) -> Estimate:
+            if given is setup:
+                return self.steady(psfs, stars)
+            return steady_estimate(given, self.penalty, self._tick)
+
+        steps, found = settle_psfs(setup, moves, run)
         if not steps:
             return psfs, stars, np.zeros(0)
-        whole, before = self.whole.observation.replace(psfs=psfs), first()
+        whole, before = self.whole.observation.replace(psfs=psfs), run(setup)
         for step in steps:
             whole = with_errors(whole, step)
         moved = np.where(found == setup.stars, stars, found)
@@ -292,9 +298,9 @@ def _is_wide(side: int, width: float, stars: Array, observation: Observation) ->
         return False
     last, end = first + cut.shape[::-1] - 1, np.array(observation.shape[::-1]) - 1
     places = np.array([observation.places(j, stars) for j in range(observation.n_images)])
-    is_near = ((first > 0) & (places < first + width)) | ((last < end) & (places > last - width))
-    is_seen = (places > -width) & (places < end + width)
-    return not (is_near.any(axis=-1) & is_seen.all(axis=-1)).any()
+    seen = places[((places > -width) & (places < end + width)).all(axis=-1)]
+    reach = (seen - width).clip(0.0), np.minimum(seen + width, end)
+    return bool((reach[0] >= first).all() and (reach[1] <= last).all())
 
 
 def find_window(

@@ -16,11 +16,9 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from lnocl.core.runs.start import Setup
-from lnocl.core.runs.steady import steady_estimate
 from lnocl.core.scene.arrays import Array
 from lnocl.core.scene.cores import fwhm
 from lnocl.core.scene.estimate import Estimate
-from lnocl.core.scene.penalty import Penalty
 from lnocl.core.solvers.least_squares import Field, LeastSquares, LinearImage
 from lnocl.core.solvers.near_star import N_STEPS, NearStar, Surroundings, brightest
 from lnocl.core.solvers.psf_errors import (
@@ -47,11 +45,7 @@ FINISHED = 1e-2
 
 
 def settle_psfs(
-    setup: Setup,
-    penalty: Penalty,
-    moves: bool,
-    tick: Callable[[], object] = int,
-    first: Callable[[], Estimate] | None = None,
+    setup: Setup, moves: bool, run: Callable[[Setup], Estimate]
 ) -> tuple[list[Array], Array]:
     """Return steps of theta, shape (n_psfs, N_SHAPES) each, and the places of the stars.
 
@@ -65,14 +59,10 @@ def settle_psfs(
     ----------
     setup : Setup
         The images and the parameters of the runs; one star or more among them.
-    penalty : Penalty
-        Of the runs.
     moves : bool
         Whether stars may be moved.
-    tick : callable, optional
-        Is called after each iteration.
-    first : callable, optional
-        Returns the estimate of the first run, where another may have made it.
+    run : callable
+        Returns the estimate of a run, `lnocl.core.runs.steady.steady_estimate`.
     """
     theta, steps = np.zeros((count(setup.observation), N_SHAPES)), list[Array]()
     of_psfs = dict(zip(alike(setup.observation).tolist(), setup.observation.psfs, strict=True))
@@ -81,7 +71,7 @@ def settle_psfs(
         return steps, setup.stars
     with suppress(DivergedError, NotFiniteError), ignored_warnings(), ignored_notes():
         for _ in range(ROUNDS):
-            estimate = first() if first and not steps else steady_estimate(setup, penalty, tick)
+            estimate = run(setup)
             found, away = _mean(estimate, theta, moves)
             step = np.where(is_sampled[:, None], found - theta, 0.0)
             steps.append(step * MAX_STEP / max(float(abs(step).max()), MAX_STEP))

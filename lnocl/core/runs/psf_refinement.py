@@ -211,8 +211,7 @@ def mend(runs: GuardedRuns, names: Sequence[str], moves: bool | str, is_asked: b
     fits = not allowance.error
     is_within = fits or _is_held(estimate.misfit, observation)
     if observation.psf_error and not is_within:  # the errors of stars hold what residuals show
-        raised = min(estimate.misfit.kappa, MOST_PSF_ERROR)
-        observation = observation.replace(psf_error=raised)
+        observation = observation.replace(psf_error=min(estimate.misfit.kappa, MOST_PSF_ERROR))
     changed = replace(changed, observation=observation)
     return Mended(changed, refinement, near_stars, fits, is_within)
 

@@ -15,8 +15,6 @@ from lnocl.core.scene.cores import core
 from lnocl.core.scene.remembered import remembered
 from lnocl.core.scene.shifting import ENDLESS, MovablePsf
 
-# Rows and columns.
-Places = tuple[NDArray[np.intp], NDArray[np.intp]]
 # The pairs of pixels on both sides of one: beside it, above and below, and across.
 DIRECTIONS = ((0, 1), (1, 0), (1, 1), (1, -1))
 # The pixels beside a cosmic ray have less than this share of a star's light there, by so many
@@ -83,7 +81,7 @@ def _sharp(
         # Of others not even dark neighbours would tell.
         at = np.nonzero(is_known & (light > CLEAR * np.sqrt(variance)))
         of_light, of_variance, of_known = (np.pad(each, 1) for each in (light, variance, is_known))
-        inside = at[0] + 1, at[1] + 1
+        inside = np.add(at, 1)
         is_sharp = np.zeros(len(at[0]), bool)
         for direction, share in zip(DIRECTIONS, shares, strict=True):
             pair, expected = _pair(of_light, inside, direction), share * light[at]
@@ -145,7 +143,7 @@ def _lobes(psf: Array, most: int) -> Array:
     return beyond[middle - half : middle + half + 1, middle - half : middle + half + 1]
 
 
-def _pair(padded: NDArray[Any], at: Places, direction: tuple[int, int]) -> NDArray[Any]:
+def _pair(padded: NDArray[Any], at: NDArray[Any], direction: tuple[int, int]) -> NDArray[Any]:
     """Return the sums of the two pixels on both sides of some along a direction."""
     (y, x), (dy, dx) = at, direction
     return np.asarray(padded[y + dy, x + dx] + padded[y - dy, x - dx])
@@ -154,7 +152,7 @@ def _pair(padded: NDArray[Any], at: Places, direction: tuple[int, int]) -> NDArr
 @remembered(2**17)  # each star asks for that of its PSF
 def _least_shares(psf: Array) -> Array:
     """Return the least share of its brightest pixel that a star has beside it, by direction."""
-    movable, shares, at = MovablePsf(psf, ENDLESS), [], (np.array([1]), np.array([1]))
+    movable, shares, at = MovablePsf(psf, ENDLESS), [], np.ones((2, 1), int)
     for y, x in product(PLACES, PLACES):
         star = movable.at(x, y).add_to(np.zeros((3, 3)), (-1, -1), ENDLESS)
         shares.append([_pair(star, at, each)[0] / star[1, 1] for each in DIRECTIONS])

@@ -79,13 +79,12 @@ def noise_of(image: Array, mask: Mask, background: Array | float) -> Noise | Non
     """
     ny, nx = (n - n % BLOCK for n in image.shape)
     image, mask = _some_rows(image[:ny, :nx]), _some_rows(mask[:ny, :nx])
-    level = np.asarray(background)
-    level = _some_rows(level[:ny, :nx]) if level.ndim else level
+    level = _some_rows(background[:ny, :nx]) if isinstance(background, np.ndarray) else background
     return _noise_of_blocks(np.where(mask, 0.0, image), mask, level)
 
 
 @remembered(2**16)  # each step of the preparation asks for that of its images
-def _noise_of_blocks(image: Array, mask: Mask, background: Array) -> Noise | None:
+def _noise_of_blocks(image: Array, mask: Mask, background: Array | float) -> Noise | None:
     """Return the noise of an image of whole blocks, 0 where a pixel is bad."""
     means = _block_means(image)
     good = _block_means(mask.astype(np.float64)) == 0

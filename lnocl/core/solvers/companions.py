@@ -190,30 +190,27 @@ def _points(
     near: NearStar, estimate: Estimate, at: tuple[NDArray[np.int_], ...]
 ) -> tuple[Array, Array]:
     """Return fluxes and errors of points at rows and columns of the sky in a window, scaled."""
-    n, scatters = len(near.prior), np.zeros((len(near.images), *near.window.shape))
+    scatters = np.zeros((len(near.images), *near.window.shape))
     if near.psfs is not None:
         scatters = near.psfs.pixels(near.window.shape).scatter
     extended = near.source.images_of(near.expected + estimate.part(near.places(estimate.scene)))
-    information, moments = np.diag([*np.zeros(n), FREE]), np.zeros(n + 1)
-    information[:n, :n] = near.prior
-    images = list[LinearImage]()
-    levels = near.fields[1].forward(np.ones(1))
-    each = zip(near.images, levels, extended, scatters, strict=True)
-    for image, flat, light, scatter in each:
+    information, n = near.prior.copy(), len(near.prior)
+    information[near.level, near.level] = FREE
+    moments, images = np.zeros(n), list[LinearImage]()
+    for image, light, scatter in zip(near.images, extended, scatters, strict=True):
         noise = 1.0 + image.precision * (2.0 * np.pi * (CORRELATED * scatter) ** 2)
         weights, left = image.precision / noise, image.left + light
-        image = image.beside([flat], np.array([n]))._replace(left=weights * left, precision=weights)
         weighted = image.slopes * weights.ravel()
         information[np.ix_(image.unknowns, image.unknowns)] += weighted @ image.slopes.T
         moments[image.unknowns] += weighted @ left.ravel()
-        images.append(image._replace(slopes=weighted))
+        images.append(image._replace(slopes=weighted, left=weights * left, precision=weights))
     known = np.diag(information)  # 0 of what no image shows
-    units = np.divide(1.0, np.sqrt(known), out=np.zeros(n + 1), where=known > 0)
-    scaled = information * units * units[:, None] + ROUNDING * np.eye(n + 1)
+    units = np.divide(1.0, np.sqrt(known), out=np.zeros(n), where=known > 0)
+    scaled = information * units * units[:, None] + ROUNDING * np.eye(n)
     inverse = np.linalg.inv(scaled) * units * units[:, None]
     fluxes, errors = np.zeros((2, len(at[0])))
     for k, (y, x) in enumerate(zip(*at, strict=True)):
-        point, shares, told, score = np.zeros(near.expected.shape), np.zeros(n + 1), 0.0, 0.0
+        point, shares, told, score = np.zeros(near.expected.shape), np.zeros(n), 0.0, 0.0
         point[y, x] = 1.0
         for image, seen in zip(images, near.source.images_of(point), strict=True):
             shares[image.unknowns] += image.slopes @ seen.ravel()

@@ -127,38 +127,6 @@ class SourceError:
         return self._smooth.apply(self._amplitude * self._adjoint(images))
 
 
-class LevelError:
-    """The error of a level of the extended source, the same in all pixels, as a field of one value.
-
-    Parameters
-    ----------
-    deviation : float
-        The standard deviation of the error, in the unit of the sky.
-    responses : ndarray of float64, shape (p, 1, 1) or (p, Ny, Nx)
-        The light of a sky of 1 in a pixel of each image.
-    shape : tuple of int
-        Shape (Ny, Nx) of the images.
-
-    Attributes
-    ----------
-    at : ndarray of float64, shape (1,)
-        The current value, which is 0.
-    """
-
-    def __init__(self, deviation: float, responses: Array, shape: tuple[int, int]) -> None:
-        self._levels, self._shape, self.at = deviation * responses, shape, np.zeros(1)
-
-    def forward(self, x: Array) -> Array:
-        """Return the changes of the images, shape (p, Ny, Nx)."""
-        levels = x[0] * self._levels
-        return np.broadcast_to(levels, (len(levels), *self._shape))
-
-    def adjoint(self, images: Sequence[Array]) -> Array:
-        """Return the transpose of `forward` applied to images, shape (1,)."""
-        pairs = zip(self._levels, images, strict=True)
-        return np.array([sum(np.sum(a * (y if a.size > 1 else y.sum())) for a, y in pairs)])
-
-
 class LeastSquares:
     """The joint least squares of a few parameters and of random fields.
 

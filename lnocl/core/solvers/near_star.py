@@ -1,7 +1,8 @@
 """The least squares of a star and of the extended source round it, in a window.
 
 The extended source is a field of the covariance that `lnocl.core.scene.texture` expects, and a
-level of about its mean there: an estimate that is positive holds light where there is none. So the
+level, an unknown of about its mean there: an estimate that is positive holds light where there is
+none. So the
 fluxes and positions of stars, and their errors, depend on no iteration. For errors the amounts of
 halos are unknown too: what the images tell of them beyond the window is their prior in it.
 
@@ -35,7 +36,6 @@ from lnocl.core.solvers.fluxes import precision
 from lnocl.core.solvers.least_squares import (
     Field,
     LeastSquares,
-    LevelError,
     LinearImage,
     SourceError,
 )
@@ -143,8 +143,10 @@ class NearStar:
         unknowns, shape by shape, and then positions.
     unknowns : ndarray of int, shape (n_held, 1 or 3)
         Those of each: its flux, and perhaps x and y, which it has in all epochs.
+    level : int
+        That of a level of the extended source, which follows them, and of which cusps do.
     n : int
-        All of these, and the cusps; those of `psfs` follow, unless they are held.
+        All of these; those of `psfs` follow, unless they are held.
     psfs : PsfErrors or None
         The errors of the PSFs there; None where they are exact.
     images : list of LinearImage
@@ -172,8 +174,7 @@ class NearStar:
         there, texture = _texture_in(self.window, around)
         self.source = self._source_error(around, texture.amplitude[there], texture.width)
         self.expected = texture.mean[there] - around.estimate.part(self.places(scene))
-        level = float(texture.mean[there].mean())
-        self._level = LevelError(level, self._responses(around), self.window.shape)
+        level = max(float(texture.mean[there].mean()), HELD**-0.5)
         beyond = self.source.images_of(self.expected)
         observation = scene.observation
         self.psfs, self._cusps = None, list[float]()
@@ -186,8 +187,8 @@ class NearStar:
             self._linearise(around, sources, *each)
             for each in zip(self._views, around.cameras, beyond, strict=True)
         ]
-        self.n = sources.n + len(self._cusps)
-        prior = [self._prior_of_halos(around, sources.n), np.eye(len(self._cusps))]
+        self.level, self.n = sources.n, sources.n + 1 + len(self._cusps)
+        prior = [self._prior_of_halos(around, sources.n), level**-2, np.eye(len(self._cusps))]
         self.prior = block_diag(*prior, *([self.psfs.prior] if self.psfs and is_free else []))
 
     def _cusp(self, around: Surroundings, star: int) -> float:
@@ -195,15 +196,6 @@ class NearStar:
         sky = around.estimate.part(self.places(around.scene))
         rows, columns = offsets_from(around.scene, star, self.window)
         return CUSP * light_of_host(sky, rows, columns, self.resolution, self.hidden)
-
-    def _responses(self, around: Surroundings) -> Array:
-        """Return what a flat sky of ones is in the window of each image."""
-        scene, shape = around.scene, self.window.shape
-        if scene.transmission is None:
-            return (scene.gains * scene.areas)[:, None, None]
-        ones = np.broadcast_to(1.0, scene.grid)
-        pairs = zip(around.cameras, self._views, strict=True)
-        return np.array([enlarged(a.part(ones, v.window.ranges), shape) for a, v in pairs])
 
     def places(self, scene: Scene) -> Places:
         """Return the rows and columns of the window in the sky, on the grid."""
@@ -230,16 +222,15 @@ class NearStar:
     @cached_property
     def fit_beside_known(self) -> LeastSquares:
         """Those with the extended source known, where PSFs are not."""
-        held = np.zeros(len(self.prior))
-        held[self.n - len(self._cusps) : self.n] = HELD
-        prior = self.prior + np.diag(held)
-        return LeastSquares(self.images, self.fields[2:], prior, N_STEPS, self._finished)
+        prior, held = self.prior.copy(), range(self.level, self.n)
+        prior[held, held] += HELD
+        return LeastSquares(self.images, self.fields[1:], prior, N_STEPS, self._finished)
 
     @cached_property
     def fields(self) -> list[Field]:
-        """The extended source, its level, and the pixels of PSFs."""
-        fields: list[Field] = [self.source, self._level]
-        return fields if self.psfs is None else [*fields, self.psfs.pixels(self.window.shape)]
+        """The extended source, and the pixels of PSFs."""
+        of_psfs = [self.psfs.pixels(self.window.shape)] if self.psfs else []
+        return [self.source, *of_psfs]
 
     def _prior_of_halos(self, around: Surroundings, n: int) -> Array:
         p, k = around.scene.n_images, len(self.held)
@@ -276,14 +267,17 @@ class NearStar:
         model = view.model(around.estimate, camera)
         image = sources.linear(view, model)
         scene, cusps = around.scene, list[Array]()
+        flat = np.full(view.window.shape, scene.gains[view.j] * scene.areas[view.j])
+        if scene.transmission is not None:
+            flat = camera.part(np.broadcast_to(1.0, scene.grid), view.window.ranges)
         for s, light in zip(self.held, self._cusps, strict=False):
             width = self.resolution / scene.oversample / scene.observation.scales[view.j]
             cusp = scene.star_cutout(view.j, s).blurred(width * DEVIATION, scene.image_grid)
             cusps.append(light * view.cut(cusp))
-        image = image.beside(cusps, sources.n + np.arange(len(cusps)))
+        image = image.beside([flat, *cusps], sources.n + np.arange(1 + len(cusps)))
         if self.psfs and not around.holds_shapes:
             of_psfs, unknowns = self.psfs.slopes(view.j, model)
-            image = image.beside(of_psfs, sources.n + len(cusps) + unknowns)
+            image = image.beside(of_psfs, sources.n + 1 + len(cusps) + unknowns)
         n, shape = len(image.unknowns), self.window.shape
         slopes = enlarged(image.slopes.reshape(n, *view.window.shape), shape)
         return LinearImage(
