@@ -285,7 +285,7 @@ def test_derivatives_of_stars_are_along_the_skys_axes():
     extended = scenes_turned.sky() / scene.unit
     fit = StarFit(scene, model, extended, scene.stars)
     stars = Stars(FLUXES / scene.unit, np.add(STARS, (0.3, -0.2)))
-    gradient, _ = fit.derivatives(stars)
+    gradient = fit._gradient(fit._try(stars))
     step = 1e-4
     for index in range(2, 6):
         axis, s = divmod(index - 2, 2)

@@ -24,12 +24,12 @@ def test_it_is_the_dense_matrix_and_its_inverse():
     dense = np.where(near, root @ root.T, 0.0) + 20 * np.eye(6)
     matrix, units, x = of_dense(dense, places), rng.uniform(1, 9, 6), rng.normal(size=(6, 2))
     assert matrix.band.shape == (3, 6)
-    np.testing.assert_array_equal(matrix.dense(), dense)
+    np.testing.assert_array_equal(matrix.block(slice(None)), dense)
     np.testing.assert_array_equal(matrix.block([4, 0, 2]), dense[np.ix_([4, 0, 2], [4, 0, 2])])
     np.testing.assert_array_equal(matrix.diagonal, np.diag(dense))
     scaled = units[:, None] * units * dense
-    np.testing.assert_allclose(matrix.scaled(units).dense(), scaled, rtol=1e-15)
-    np.testing.assert_array_equal((matrix + matrix).dense(), 2 * dense)
+    np.testing.assert_allclose(matrix.scaled(units).block(slice(None)), scaled, rtol=1e-15)
+    np.testing.assert_array_equal((matrix + matrix).block(slice(None)), 2 * dense)
     np.testing.assert_allclose(matrix.solve(x), np.linalg.solve(dense, x), rtol=1e-10)
     np.testing.assert_array_equal(matrix.solve(x[:, 0]), matrix.solve(x)[:, 0])
 
@@ -58,8 +58,8 @@ def test_unknowns_that_are_one_are_summed(seed):
     band[0] += 2 * width
     matrix = BandMatrix(band, rng.permutation(m))
     tied, which = matrix.tied(owners), np.eye(6)[owners]
-    expected = which.T @ matrix.dense() @ which
-    np.testing.assert_allclose(tied.dense(), expected, rtol=1e-14)
+    expected = which.T @ matrix.block(slice(None)) @ which
+    np.testing.assert_allclose(tied.block(slice(None)), expected, rtol=1e-14)
     x = rng.standard_normal(6)
     np.testing.assert_allclose(tied.solve(x), np.linalg.solve(expected, x), rtol=1e-10)
 

@@ -114,6 +114,25 @@ def test_variances_are_those_of_the_inverse_and_lack_no_more_than_is_said():
     assert alone[0] == pytest.approx(expected[-1], rel=least_squares.MISSING)
 
 
+def test_stars_that_light_little_of_a_window_are_held_without_its_dark_pixels(monkeypatch):
+    images, field, k = nights(4)
+    images = [
+        each._replace(slopes=np.where(each.slopes > 0.5, each.slopes, 0.0)) for each in images
+    ]
+    fits = []
+    for share in (0.0, 0.25):
+        monkeypatch.setattr(least_squares, "SPARSE", share)
+        fits.append(LeastSquares(images, [field], np.full(k, 0.1), 2000, 1e-12))
+    assert [isinstance(fit._images[0].slopes, np.ndarray) for fit in fits] == [True, False]
+    np.testing.assert_allclose(fits[1].information, fits[0].information, rtol=1e-14, atol=1e-14)
+    for name, given in (("solve", ()), ("variances", (range(k),)), ("row", (2,))):
+        whole, sparse = (getattr(fit, name)(*given) for fit in fits)
+        if name == "variances":
+            whole, sparse = (whole,), (sparse,)
+        for one, other in zip(whole, sparse, strict=True):
+            np.testing.assert_allclose(np.ravel(other), np.ravel(one), rtol=1e-9, atol=1e-12)
+
+
 def test_epochs_share_the_solutions_of_their_variances(monkeypatch):
     """With a solution for each, products of the matrix would grow as the number of epochs."""
     products, curvature = [], LeastSquares._curvature

@@ -225,6 +225,7 @@ class GuardedRuns:
             stars=inside(found.scene.places, self.observation),
             initial_extended=np.maximum(found.observed_sky, 0.0),
             initial_star_fluxes=found.star_fluxes[: found.scene.n_stars],
+            looks_round=False,
         )
         start = hold_halos(make_start(setup, penalty), found)
         # Stars are moved at the start of a round alone.

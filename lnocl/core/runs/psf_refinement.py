@@ -232,7 +232,7 @@ def _beside_stars(runs: GuardedRuns) -> Array:
     found, observation = list[Companion](), runs.whole.observation
     psfs = observation.psfs_over_images
     if are_noisy(observation.psfs):
-        psfs = _without_noise(psfs, observation)
+        psfs = mapped(psfs, lambda _, stack: without_noise(stack, observation.oversample))
     with suppress(DivergedError, NotFiniteError), ignored_warnings(), ignored_notes():
         _, found = companions(runs.steady(psfs, runs.stars))
     places = runs.first + np.reshape([each.place for each in found], (-1, 2))
@@ -266,14 +266,11 @@ def _clean(runs: GuardedRuns, state: _State) -> _State:
     Noise of wings hands the light of stars to the extended source, which it spreads, and nothing of
     that shows at the stars.
     """
-    psfs = _without_noise(state.psfs, runs.observation)
+    q = runs.observation.oversample
+    psfs = mapped(state.psfs, lambda _, stack: without_noise(stack, q))
     cleaned = _State.of(runs, psfs, state.places, state.moves)
     is_worse = cleaned.misfit.significance > state.misfit.significance + GONE
     return state if is_worse else cleaned
-
-
-def _without_noise(psfs: Psfs, observation: Observation) -> Psfs:
-    return mapped(psfs, lambda _, stack: without_noise(stack, observation.oversample))
 
 
 def _fit(

@@ -27,7 +27,8 @@ class Setup:
 
     Attributes are the arguments of `deconvolve`, checked; `stars` are the positions as given, and
     `settles_halos` whether halos are held at what `lnocl.core.runs.halos` finds. `in_time` is
-    whether exposures were given, where those of the observation were changed.
+    whether exposures were given, where those of the observation were changed, and `looks_round`
+    whether stars may lie in another minimum than the nearest, where they are moved.
     """
 
     observation: Observation
@@ -42,6 +43,7 @@ class Setup:
     initial_star_fluxes: Array | None = None
     settles_halos: bool = False
     in_time: bool | None = None
+    looks_round: bool = True
 
     @property
     def is_rate(self) -> bool:
@@ -166,7 +168,7 @@ def make_start(setup: Setup, penalty: Penalty) -> Start:
     if refines or setup.solver == "sgp":
         model = make_model(scene)  # which is large, and goes with this block
         if refines:
-            star_fluxes = move_stars(setup, scene, model, extended, star_fluxes, look_round=True)
+            star_fluxes = move_stars(setup, scene, model, extended, star_fluxes, setup.looks_round)
         star_fluxes, scaling = measure_steps(setup, scene, model, extended, star_fluxes)
     return Start(setup, scene, extended, star_fluxes, scaling)
 

@@ -38,15 +38,11 @@ class BandMatrix:
         """The elements of each unknown with itself."""
         return np.asarray(self.band[0, self.places])
 
-    def block(self, unknowns: Sequence[int] | NDArray[np.int_]) -> Array:
-        """Return the elements of some of the unknowns, shape (n, n)."""
+    def block(self, unknowns: Sequence[int] | NDArray[np.int_] | slice) -> Array:
+        """Return the elements of some of the unknowns, shape (n, n), or with a slice of all."""
         at = self.places[unknowns]
         apart, first = abs(at - at[:, None]), np.minimum(at, at[:, None])
         return np.where(apart < len(self.band), self.band[apart % len(self.band), first], 0.0)
-
-    def dense(self) -> Array:
-        """Return all elements, shape (m, m)."""
-        return self.block(np.arange(len(self.places)))
 
     def scaled(self, units: Array) -> BandMatrix:
         """Return the matrix with each unknown in other units: its rows and columns times these."""

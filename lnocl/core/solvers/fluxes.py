@@ -143,14 +143,19 @@ def fit_fluxes(scene: Scene, model: Model, diffuse: Array, fluxes: Array) -> Arr
     used = list[Array]()
     for _ in range(FIT_ROUNDS):
         models = likelihood.models([each.light(fluxes) for each in stars])
-        changes = zip(models, used, strict=False)
-        if not used or any((abs(m - u) > INFORMATION_CHANGE * u).any() for m, u in changes):
+        if differ(models, used):
             information, used = likelihood.information(stars, models), models
         step = bounded_step(information, likelihood.gradient(stars, models)[0], fluxes)
         fluxes = fluxes + step
         if (abs(step) * np.sqrt(information.diagonal) <= FIT_CHANGE).all():
             break
     return fluxes
+
+
+def differ(models: Sequence[Array], used: Sequence[Array]) -> bool:
+    """Return whether models are so far from those that an information is of, if any."""
+    pairs = zip(models, used, strict=False)
+    return not used or any((abs(m - u) > INFORMATION_CHANGE * u).any() for m, u in pairs)
 
 
 def variances(information: Array) -> Array:

@@ -23,12 +23,15 @@ from typing import NamedTuple, Protocol
 import numpy as np
 import scipy.linalg
 from numpy.typing import NDArray
+from scipy.sparse import csr_array
 
 from lnocl.core.scene.arrays import Array
 from lnocl.core.scene.smooth_field import SmoothField
 
 # A variance may be too small by this share of it, and a change off by so many standard errors.
 MISSING, NEGLIGIBLE = 1e-4, 1e-4
+# Derivatives of which a smaller share is not 0 are held as a sparse array.
+SPARSE = 0.25
 # Added to the diagonal of the information, which is scaled to 1 before.
 ROUNDING = 1e-12
 
@@ -38,7 +41,7 @@ class LinearImage(NamedTuple):
 
     Attributes
     ----------
-    slopes : ndarray of float64, shape (n, Ny * Nx)
+    slopes : ndarray or csr_array of float64, shape (n, Ny * Nx)
         Derivatives of the model with respect to the n parameters that it depends on.
     unknowns : ndarray of int, shape (n,)
         Indices of these among all parameters, without repeats.
@@ -158,13 +161,14 @@ class LeastSquares:
         n_steps: int,
         finished: float,
     ) -> None:
-        self._images, self._fields = images, fields
+        self._images = [each._replace(slopes=_sparse(each.slopes)) for each in images]
+        self._fields = fields
         self._prior = prior = np.diag(prior) if prior.ndim == 1 else prior
         self._n_steps, self._finished = n_steps, finished
         self._ends = np.cumsum([field.at.size for field in fields])[:-1]
         self.information = information = prior.copy()
-        for each in images:
-            block = _sum("ik,jk->ij", each.slopes * each.precision.ravel(), each.slopes)
+        for each in self._images:
+            block = _product(each.slopes * each.precision.reshape(1, -1), each.slopes.T)
             information[np.ix_(each.unknowns, each.unknowns)] += block
         self._units = 1.0 / np.sqrt(np.maximum(np.diag(information), np.finfo(float).tiny))
         scaled = information * self._units * self._units[:, None]
@@ -205,9 +209,9 @@ class LeastSquares:
         columns = [self._invert(unit) for unit in np.eye(len(self._prior))[unknowns]]
         found = np.array([column[i] for column, i in zip(columns, unknowns, strict=True)])
         rests = np.array([self._adjoint(self._changes(column)) for column in columns])
-        least = self._finished**2 * _squares(rests)
+        least = self._finished**2 * _sum("ik,ik->i", rests, rests)
         for _ in columns:
-            squares, enough = _squares(rests), np.maximum(least, MISSING * found)
+            squares, enough = _sum("ik,ik->i", rests, rests), np.maximum(least, MISSING * found)
             worst = int(np.argmax(squares / enough))
             if squares[worst] <= enough[worst]:
                 break
@@ -230,16 +234,12 @@ class LeastSquares:
             image *= each.precision
         return float(direct[unknown] + _sum("i,i", wanted, x)), seen
 
-    def _left(self) -> Array:
-        """Return the residuals of all images, shape (p, Ny, Nx)."""
-        return np.array([each.left for each in self._images])
-
     def _solve(self, pull: Array) -> tuple[Array, Array]:
         """Return the changes of the parameters, shape (k,), and of the fields, one after the other.
 
         `pull` is half the gradient of the prior of the parameters, shape (k,).
         """
-        left = self._left()
+        left = np.array([each.left for each in self._images])
         direct = self._invert(self._moments(left) - pull)
         at = np.concatenate([field.at.ravel() for field in self._fields])
         x = self._find_fields(self._adjoint(left - self._changes(direct)) - at)
@@ -301,8 +301,7 @@ class LeastSquares:
         """Return ``sum_j J_j^T P_j y_j`` of images y, shape (k,)."""
         moments = np.zeros(len(self._prior))
         for each, image in zip(self._images, images, strict=True):
-            weighted = (each.precision * image).ravel()
-            moments[each.unknowns] += _sum("ik,k->i", each.slopes, weighted)
+            moments[each.unknowns] += _product(each.slopes, (each.precision * image).ravel())
         return moments
 
     def _changes(self, change: Array) -> Array:
@@ -310,7 +309,7 @@ class LeastSquares:
         images = np.zeros((len(self._images), *self._images[0].left.shape))
         for image, each in zip(images, self._images, strict=True):
             if (own := change[each.unknowns]).any():
-                image[:] = _sum("i,ik->k", own, each.slopes).reshape(image.shape)
+                image[:] = _product(each.slopes.T, own).reshape(image.shape)
         return images
 
     def _invert(self, moments: Array) -> Array:
@@ -318,9 +317,17 @@ class LeastSquares:
         return np.asarray(self._units * scipy.linalg.cho_solve(self._factor, self._units * moments))
 
 
-def _squares(vectors: Array) -> Array:
-    """Return the square of each row."""
-    return _sum("ik,ik->i", vectors, vectors)
+def _sparse(slopes: Array) -> Array | csr_array:
+    """Return derivatives, most of which are 0 where stars light little of a window."""
+    return csr_array(slopes) if np.count_nonzero(slopes) < SPARSE * slopes.size else slopes
+
+
+def _product(matrix: Array | csr_array, other: Array | csr_array) -> Array:
+    """Return a product without BLAS."""
+    if isinstance(matrix, np.ndarray):
+        return _sum("ik,k...->i...", matrix, other)
+    product = matrix @ other
+    return np.asarray(product if isinstance(product, np.ndarray) else product.toarray())
 
 
 def _sum(products: str, a: Array, b: Array) -> Array:

@@ -25,7 +25,7 @@ from lnocl.core.scene.stars import (
     order_of,
     places,
 )
-from lnocl.core.solvers.fluxes import MAX_FADING, StarLikelihood
+from lnocl.core.solvers.fluxes import MAX_FADING, StarLikelihood, differ
 
 # The farthest that a star goes in one step, pixels: the likelihood is a parabola in a part of the
 # PSF's core only.
@@ -150,16 +150,21 @@ class StarFit:
         """Return J_0 over the pixels that stars may light, but for a constant."""
         return self._try(stars).objective
 
-    def derivatives(self, stars: Stars) -> tuple[Array, BandMatrix]:
-        """Return gradient and Fisher information of J_0 in (c_1 ... c_n, x_1 ..., y_1 ...)."""
-        return self._derivatives(self._try(stars))
-
-    def _derivatives(self, trial: _Trial) -> tuple[Array, BandMatrix]:
-        fluxes = trial.stars.fluxes
-        units = np.concatenate([np.ones_like(fluxes), fluxes, fluxes])
+    def _gradient(self, trial: _Trial) -> Array:
+        """Return the gradient of J_0 in (c_1 ... c_n, x_1 ..., y_1 ...), a place in all epochs."""
         gradient = self._likelihood.gradient(trial.images, trial.models).ravel()
+        return np.asarray(np.bincount(self._owners, self._units(trial) * gradient))
+
+    def _information(self, trial: _Trial) -> BandMatrix:
+        """Return the Fisher information of the same unknowns."""
         information = self._likelihood.information(trial.images, trial.models)
-        return units * gradient, information.scaled(units)
+        information = information.scaled(self._units(trial))
+        return information.tied(self._owners) if self._n_epochs > 1 else information
+
+    @staticmethod
+    def _units(trial: _Trial) -> Array:
+        fluxes = trial.stars.fluxes
+        return np.concatenate([np.ones_like(fluxes), fluxes, fluxes])
 
     def look_round(self, stars: Stars) -> Stars:
         """Return each star at the best of nine places, the others where they are, and its fluxes.
@@ -201,13 +206,11 @@ class StarFit:
 
     def minimise(self, stars: Stars) -> Stars:
         """Return the stars that are most likely, sought from these."""
-        trial = self._try(stars)
+        trial, used = self._try(stars), list[Array]()
         for _ in range(MAX_STEPS):
-            gradient, information = self._derivatives(trial)
-            if self._n_epochs > 1:
-                gradient = np.asarray(np.bincount(self._owners, gradient), np.float64)
-                information = information.tied(self._owners)
-            step = -information.solve(gradient)[self._owners]
+            if differ(trial.models, used):
+                information, used = self._information(trial), trial.models
+            step = -information.solve(self._gradient(trial))[self._owners]
             for _ in range(MAX_HALVED):
                 following = self._try(self._follow(trial.stars, step))
                 if following.objective <= trial.objective:
@@ -215,13 +218,8 @@ class StarFit:
                 step = step / 2.0
             else:
                 return trial.stars
-            change = np.concatenate(
-                [
-                    following.stars.fluxes - trial.stars.fluxes,
-                    *(following.stars.positions - trial.stars.positions).T,
-                ]
-            )
-            trial = following
+            before, after, trial = trial.stars, following.stars, following
+            change = np.append(after.fluxes - before.fluxes, (after.positions - before.positions).T)
             if (abs(change) * np.sqrt(information.diagonal[self._owners]) < FINISHED).all():
                 break
         return trial.stars
@@ -231,9 +229,8 @@ class StarFit:
         n = len(stars.fluxes)
         fluxes = np.maximum(stars.fluxes + step[:n], MAX_FADING * stars.fluxes)
         moves = _shorten(step[n:].reshape(2, n).T, MAX_STEP)
-        return Stars(
-            fluxes, self._given + _shorten(stars.positions + moves - self._given, MAX_SHIFT)
-        )
+        away = _shorten(stars.positions + moves - self._given, MAX_SHIFT)
+        return Stars(fluxes, self._given + away)
 
 
 class _MovableStars:
@@ -275,11 +272,7 @@ class _MovableStars:
         order: Order,
         is_shown: NDArray[np.bool_],
     ) -> None:
-        self._grid, self._covered, self._order = (
-            (covered.shape[0], covered.shape[1]),
-            covered,
-            order,
-        )
+        self._grid, self._covered, self._order = (*covered.shape,), covered, order
         self._psfs, self._turn, self._places = psfs, turn, places(covered)
         self._is_shown = is_shown
         # One number more, which the dark pixels share: their place is -1.
