@@ -90,7 +90,7 @@ class StarWindows:
         blocks, columns, first = [], [], np.arange(step) == 0
         for of_star in boxes:
             for a, coarse in enumerate(of_star):
-                box = Covered(*(np.kron(each, first) for each in coarse))
+                box = Covered(*(np.kron(each, first) if step > 1 else each for each in coarse))
                 blocks.append(layout.window(box.rows))
                 columns.append(_rolled_arc(box, rolls[a]) if rolls else shortest_arc(box.columns))
         self.corners = np.array(

@@ -378,15 +378,13 @@ def covered_box(
 ) -> Covered:
     """Return the rows and columns that cutouts cover where stars move by up to `max_shift`."""
     box = Covered(*(np.zeros(n, bool) for n in grid))
+    distance = int(np.ceil(max_shift)) + MARGIN + 1 if max_shift else 0
+    steps = np.arange(-distance, distance + 1)
     for cutout in cutouts:
         for axis, at in enumerate((cutout.rows(grid), cutout.columns(grid))):
             is_covered = (cutout.values != 0).any(axis=1 - axis) | (max_shift > 0)
-            box[axis][at[is_covered]] = True
-    if not max_shift:
-        return box
-    distance = int(np.ceil(max_shift)) + MARGIN + 1
-    steps = range(-distance, distance + 1)
-    return Covered(*(np.any([np.roll(each, step) for step in steps], axis=0) for each in box))
+            box[axis][(at[is_covered, None] + steps) % grid[axis]] = True
+    return box
 
 
 # Stars that are nearer to each other, in pixels, are one: nothing tells their fluxes apart.
