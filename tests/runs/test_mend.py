@@ -162,6 +162,19 @@ def test_psfs_and_places_that_stars_show_are_used_unless_they_fit_worse(is_moved
     assert _settle(faded, before, is_moved) is before
 
 
+def test_stars_that_psfs_have_moved_are_judged_where_they_are():
+    """Beside a lopsided host one that is moved from a flat sky follows the host."""
+    runs, asked = settling(state(0.0, 1e4)), []
+    of_stars = runs.fit
+    runs.fit = lambda psfs, places, moves: asked.append((places, moves)) or of_stars()
+    found = _settle(runs, state(0.2, 1e4), True)
+    assert found.moves
+    assert found.misfit.kappa == 0
+    ((places, moves),) = asked
+    np.testing.assert_array_equal(places, 2.0)
+    assert not moves
+
+
 def test_psfs_before_are_judged_only_where_those_of_the_stars_are_in_doubt_or_take_light():
     asked = []
     before = state(0.2, 1e4)
