@@ -9,11 +9,10 @@ from scipy.ndimage import gaussian_filter
 
 import lnocl
 from lnocl.core.runs import psf_posterior
-from lnocl.core.runs.guarded_runs import GuardedRuns
+from lnocl.core.runs.guarded_runs import GuardedRuns, steady_estimate
 from lnocl.core.runs.outcome import PsfRefinement
 from lnocl.core.runs.psf_refinement import mend
 from lnocl.core.runs.start import Setup
-from lnocl.core.runs.steady import steady_estimate
 from lnocl.core.scene.cores import fwhm
 from lnocl.core.scene.penalty import Penalty, recommend_smoothing
 from lnocl.core.solvers.psf_errors import with_errors

@@ -24,7 +24,7 @@ from lnocl.core.runs.halos import hold_halos, settle_halos
 from lnocl.core.runs.psf_posterior import settle_psfs
 from lnocl.core.runs.run import Run
 from lnocl.core.runs.start import Setup, make_model, make_start
-from lnocl.core.runs.steady import STEADY, steady_estimate
+from lnocl.core.runs.steady import STEADY, run_steadily
 from lnocl.core.scene.arrays import Array
 from lnocl.core.scene.estimate import Estimate
 from lnocl.core.scene.forward_model import Model
@@ -52,8 +52,9 @@ FIRST_ERROR, SETTLED, MAX_ROUNDS = 0.3, 0.1, 4
 # The weight of the edge-preserving term near stars, in standard deviations of the gradient of the
 # data term by the error of the PSFs: the halo that a wrong Strehl ratio leaves bends less.
 GUARD = 20.0
-# Iterations of the first round, and of each further one, which begins where that ended.
-FIRST_ITERATIONS, ITERATIONS = 40, 30
+# Iterations of the first round, and of each further one, which begins where that ended; and of
+# runs with one weight, at most.
+FIRST_ITERATIONS, ITERATIONS, N_ITER = 40, 30, 300
 # The extended source of these runs may lack structure of this share of its light.
 UNRESOLVED = 0.25
 # The error of a PSF's pixel is a share of the PSF, smoothed over so many pixels of the images.
@@ -271,6 +272,20 @@ class GuardedRuns:
             return np.asarray(whole / whole.sum(axis=(1, 2), keepdims=True))
 
         return mapped(psfs, complete)
+
+
+def steady_estimate(setup: Setup, penalty: Penalty, tick: Callable[[], object] = int) -> Estimate:
+    """Return the estimate of a run with stars where they are given, and halos held.
+
+    Raises
+    ------
+    DivergedError, NotFiniteError
+        As `Run`.
+    """
+    setup = replace(setup, solver="sgp", refine_positions=False)
+    with ignored_warnings(), ignored_notes():
+        start = settle_halos(make_start(setup, penalty))
+        return run_steadily(start, penalty, N_ITER, tick).estimate
 
 
 def inside(stars: Array, observation: Observation) -> Array:

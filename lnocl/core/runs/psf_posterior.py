@@ -62,7 +62,7 @@ def settle_psfs(
     moves : bool
         Whether stars may be moved.
     run : callable
-        Returns the estimate of a run, `lnocl.core.runs.steady.steady_estimate`.
+        Returns the estimate of a run, `lnocl.core.runs.guarded_runs.steady_estimate`.
     """
     theta, steps = np.zeros((count(setup.observation), N_SHAPES)), list[Array]()
     of_psfs = dict(zip(alike(setup.observation).tolist(), setup.observation.psfs, strict=True))

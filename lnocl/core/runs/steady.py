@@ -17,20 +17,16 @@ from dataclasses import replace
 
 import numpy as np
 
-from lnocl.core.runs.halos import settle_halos
 from lnocl.core.runs.outcome import Outcome
 from lnocl.core.runs.run import Run
-from lnocl.core.runs.start import Setup, Start, make_start
+from lnocl.core.runs.start import Start
 from lnocl.core.runs.stopping import Change
-from lnocl.core.scene.estimate import Estimate
 from lnocl.core.scene.penalty import Penalty
 from lnocl.core.scene.star_prior import StarPrior
 from lnocl.process import ignored_notes, ignored_warnings
 
 # Its weight in those that are recommended; that of runs with wrong PSFs too.
 STEADY = 3.0
-# Iterations at most of one in a window.
-N_ITER = 300
 # It ends where the objective falls by less than this share of itself in an iteration.
 SETTLED = 1e-5
 # The share of the gradient at which the conjugate gradients of errors end.
@@ -72,20 +68,6 @@ def run_steadily(
             if rule.met(run):
                 return run.outcome(rule.reason)
         return run.outcome("n_iter" if run.done == n_iter else "converged")
-
-
-def steady_estimate(setup: Setup, penalty: Penalty, tick: Callable[[], object] = int) -> Estimate:
-    """Return the estimate of a run with stars where they are given, and halos held.
-
-    Raises
-    ------
-    DivergedError, NotFiniteError
-        As `Run`.
-    """
-    setup = replace(setup, solver="sgp", refine_positions=False)
-    with ignored_notes(), ignored_warnings():
-        start = settle_halos(make_start(setup, penalty))
-        return run_steadily(start, penalty, N_ITER, tick).estimate
 
 
 def told_prior(outcome: Outcome) -> StarPrior:
