@@ -247,13 +247,16 @@ def _settle(runs: GuardedRuns, state: _State, moves: bool) -> _State:
     """Return the state with PSFs that are the mean of what they may be, unless they fit worse.
 
     Those before are judged too where these are in doubt, or a star has lost its light to them.
-    Stars are judged where they were found: moved from a flat sky they may follow a host.
+    Stars that were moved are moved again for these, but where they follow a host from a flat sky.
     """
     psfs, stars, before = runs.settled(state.psfs, state.places, moves)
     is_moved = bool((stars != state.places).any())
     if psfs is state.psfs and not is_moved:
         return state
-    settled = replace(_State.of(runs, psfs, stars, state.moves), moves=state.moves or is_moved)
+    settled = _State.of(runs, psfs, stars, state.moves or is_moved)
+    if is_moved and settled.misfit.is_doubtful:
+        stay = replace(_State.of(runs, psfs, stars, state.moves), moves=True)
+        settled = min(settled, stay, key=lambda each: each.misfit.significance)
     if not settled.misfit.is_doubtful and (settled.star_fluxes >= FADED * before).all():
         return settled
     is_worse = settled.misfit.significance > state.misfit.significance + GONE
