@@ -8,7 +8,7 @@ import pytest
 from scipy.ndimage import gaussian_filter
 
 import lnocl
-from lnocl.core.runs import psf_posterior
+from lnocl.core.runs import psf_posterior, psf_refinement
 from lnocl.core.runs.guarded_runs import GuardedRuns, steady_estimate
 from lnocl.core.runs.outcome import PsfRefinement
 from lnocl.core.runs.psf_refinement import mend
@@ -136,7 +136,8 @@ def test_an_error_that_is_left_counts_in_fluxes_where_psfs_are_said_to_be_exact(
 
 
 @pytest.mark.exhaustive
-def test_a_companion_is_not_taken_for_the_psf_where_little_is_wrong():
+def test_a_companion_that_is_not_found_is_not_taken_for_the_psf_where_little_is_wrong(monkeypatch):
+    monkeypatch.setattr(psf_refinement, "companions", lambda estimate: (estimate, []))
     companion = np.where((X == 32) & (Y == 32), 0.02 * FLUX, 0.0)
     known = {"exposure": DEPTHS[:1], "psf_error": 0.03}
     observation = observe(TRUE[:1], [TRUE[0] / 1.05], sky=companion, **known)
