@@ -110,11 +110,10 @@ class _State:
 def mend(runs: GuardedRuns, names: Sequence[str], moves: bool | str, is_asked: bool) -> Mended:
     """Return a setup whose positions and PSFs are mended where the images ask for it.
 
-    Points beside the stars, which PSFs that may have an error would follow, are held meanwhile.
-    The noise of PSFs that have negative pixels, but for exact ones that fit, is taken from their
-    wings first, unless they fit worse so. PSFs that may have an error then become the
-    mean of what the stars show of it (`lnocl.core.runs.psf_posterior`), unless they are in doubt
-    and fit worse so.
+    Points beside the stars, which PSFs that may have an error would follow, are held meanwhile. The
+    noise of PSFs that have negative pixels, but for exact ones that fit, is taken from their wings
+    first, unless they fit worse so. PSFs that may have an error then become the mean of what the
+    stars show of it (`lnocl.core.runs.psf_posterior`), unless they are in doubt and fit worse so.
     Where they are off by no more than that error holds, neither jitter nor pixels are fitted
     unasked, and stars take their marginal fluxes. Where they are off by more, the error is raised
     at the end to what holds it.

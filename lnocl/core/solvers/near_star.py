@@ -2,9 +2,9 @@
 
 The extended source is a field of the covariance that `lnocl.core.scene.texture` expects, and a
 level, an unknown of about its mean there: an estimate that is positive holds light where there is
-none. So the
-fluxes and positions of stars, and their errors, depend on no iteration. For errors the amounts of
-halos are unknown too: what the images tell of them beyond the window is their prior in it.
+none. So the fluxes and positions of stars, and their errors, depend on no iteration. For errors the
+amounts of halos are unknown too: what the images tell of them beyond the window is their prior in
+it.
 
 Where PSFs are not exact their errors are unknown too (`lnocl.core.solvers.psf_errors`). So is a
 cusp of the extended source under each star that has a host (`lnocl.core.scene.hosts`), a Gaussian
@@ -33,12 +33,7 @@ from lnocl.core.scene.texture import Texture, hidden_radii, hidden_radius, resol
 from lnocl.core.scene.transforms import enlarged
 from lnocl.core.scene.view import Places, View, Window
 from lnocl.core.solvers.fluxes import precision
-from lnocl.core.solvers.least_squares import (
-    Field,
-    LeastSquares,
-    LinearImage,
-    SourceError,
-)
+from lnocl.core.solvers.least_squares import Field, LeastSquares, LinearImage, SourceError
 from lnocl.core.solvers.psf_errors import VARIANCE, PsfErrors
 from lnocl.core.solvers.sources import Sources
 
