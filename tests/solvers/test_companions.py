@@ -147,8 +147,8 @@ def test_fluxes_are_those_of_least_squares_with_all_unknowns():
     values = np.concatenate([*right, np.zeros(n)])
     solved = np.linalg.lstsq(matrix, values, rcond=None)[0]
     expected = np.sqrt(np.linalg.inv(matrix.T @ matrix)[-1, -1])
-    assert fluxes[0] == pytest.approx(solved[-1], rel=1e-3)
-    assert errors[0] == pytest.approx(expected, rel=1e-3)
+    assert fluxes[0] == pytest.approx(solved[-1], rel=1e-6)
+    assert errors[0] == pytest.approx(expected, rel=1e-6)
 
 
 def test_errors_beside_a_star_are_those_of_points_at_like_distances():
