@@ -103,10 +103,8 @@ def speed(device):
                 count = 12 if turn else 2
                 begin = time.perf_counter()
                 for _ in range(count):
-                    engine.ratio()
-                    engine.correct()
-                    engine.scale()
-                engine.objectives()
+                    engine.tick()
+                engine.look()
                 if turn:
                     times[key].append(1e3 * (time.perf_counter() - begin) / count)
         for q in sorted({q for q, _ in runs}):

@@ -15,7 +15,6 @@ import lnocl
 from lnocl.core.engines.opencl import OpenCLEngine
 from lnocl.core.scene.forward_model import Model
 from lnocl.core.solvers.scaling import prepare
-from lnocl.core.solvers.sgp import sgp
 
 WORKERS = os.cpu_count()
 
@@ -43,15 +42,13 @@ class Lnocl:
     def __call__(self, count):
         """Do some iterations and wait for the last."""
         self.enqueue(count)
-        self.engine.star_fluxes()
-        self.engine.objectives()
+        self.engine.look()
 
     def enqueue(self, count):
         """Do some iterations as `lnocl.deconvolve` does them."""
+        self.engine.go_on(1_000_000, 0.0)
         for _ in range(count):
-            self.engine.ratio()
-            self.engine.correct()
-            self.engine.scale()
+            self.engine.tick()
 
     @property
     def extended(self):
@@ -72,14 +69,20 @@ class Steps:
 
     def _begin(self):
         self.engine.start(*self._start)
-        self._iterations = sgp(self.engine, 1_000_000)
 
     def __call__(self, count):
-        """Do some iterations and wait for the last."""
-        for _ in range(count):
-            if next(self._iterations, None) is None:  # at the minimum
-                self._begin()
-                next(self._iterations)
+        """Do some iterations and wait for the last, as a run does."""
+        goal = self.engine.look().done + count
+        while True:
+            self.engine.go_on(goal + 1, 0.0)
+            for _ in range(goal - self.engine.look().done):
+                self.engine.tick()
+            while self.engine.look().going:
+                self.engine.tick()
+            if self.engine.look().done == goal:
+                return
+            goal -= self.engine.look().done  # at the minimum
+            self._begin()
 
 
 class Peer:

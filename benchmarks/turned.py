@@ -74,19 +74,14 @@ def make_engine(grid, solver, is_turned):
     return engine
 
 
-def iterate(engine, solver, count):
+def iterate(engine, count):
     """Do some iterations; return seconds an iteration."""
-    begin = time.perf_counter()
+    begin, goal = time.perf_counter(), engine.look().done + count
+    engine.go_on(goal + 1, 0.0)
     for _ in range(count):
-        engine.ratio()
-        engine.correct()
-        if solver == "sgm":
-            engine.scale()
-        else:
-            engine.gradient()
-            engine.star_gradient()
-            engine.step(1.0, 1.0)
-    engine.objective()
+        engine.tick()
+    while engine.look().going:
+        engine.tick()
     return (time.perf_counter() - begin) / count
 
 
@@ -94,9 +89,9 @@ def time_ratio(grid, solver, turns):
     """Return milliseconds without a turn, and the quartiles of the ratio."""
     engines = [make_engine(grid, solver, is_turned) for is_turned in (False, True)]
     for engine in engines:
-        iterate(engine, solver, 3)
-    count = max(1, round(SECONDS_A_TURN / iterate(engines[0], solver, 3)))
-    times = np.array([[iterate(e, solver, count) for e in engines] for _ in range(turns)])
+        iterate(engine, 3)
+    count = max(1, round(SECONDS_A_TURN / iterate(engines[0], 3)))
+    times = np.array([[iterate(e, count) for e in engines] for _ in range(turns)])
     return 1e3 * np.median(times[:, 0]), *np.quantile(times[:, 1] / times[:, 0], (0.5, 0.25, 0.75))
 
 

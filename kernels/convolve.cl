@@ -127,20 +127,21 @@ INLINE cvec convolved(
  * of image `first`: an image alone, n_images of 1, has a sky of its own (transmit.cl).
  * spectra: n_images arrays, written but for their padding. otfs: n_images arrays, const;
  * otf_edges: [n_images][NY][2]. row_phases (HAS_TURNS), by which rows are multiplied then:
- * [n_images][COLUMN_BLOCKS][NY / PHASE_ROWS + PHASE_ROWS][2][BLOCK].
+ * [n_images][COLUMN_BLOCKS][NY / PHASE_ROWS + PHASE_ROWS][2][BLOCK]. steps[GOING] 0: nothing.
  * Launch: up to COLUMN_BLOCKS groups. In place. Scratch: SCRATCH_POINTS.
  * Twin: reference.convolve_columns.
  */
 KERNEL void convolve_columns(
     __global vec *restrict spectra, __global const vec *restrict otfs,
     __global const real *restrict otf_edges, __global const vec *restrict row_phases,
-    const int first, const int n_images, __global const real *restrict column_roots,
-    __global const real *restrict image_column_roots, SCRATCH vec *restrict scratch)
+    __global const real *restrict steps, const int first, const int n_images,
+    __global const real *restrict column_roots, __global const real *restrict image_column_roots,
+    SCRATCH vec *restrict scratch)
 {
     spectra += (size_t)first * SPECTRA_SIZE;
     otfs += (size_t)first * PIXELS_SIZE;
     otf_edges += 2 * first * NY;
-    FOR_EACH_BLOCK(block, COLUMN_BLOCKS) {
+    FOR_EACH_BLOCK_IF(steps[GOING], block, COLUMN_BLOCKS) {
         __global vec *columns = spectra + (size_t)block * ROWS * 2 * SIDE;
         SCRATCH_OF(scratch, columns);
 #if SCRATCH_BLOCKS > 1
@@ -180,20 +181,21 @@ KERNEL void convolve_columns(
 
 /* spectra_0 <- IFFT(sum_j conj(otfs_j) FFT(spectra_j)) along the columns: the row spectrum of
  * sum_j A_j^T (r_j - w_j) from those of the r_j - w_j. Shapes as in convolve_columns; array 0 alone
- * is written.
+ * is written. steps[FRESH] 0: nothing.
  * Launch: up to COLUMN_BLOCKS groups. In place. Scratch: SCRATCH_POINTS.
  * Twin: reference.correlate_columns.
  */
 KERNEL void correlate_columns(
     __global vec *restrict spectra, __global const vec *restrict otfs,
     __global const real *restrict otf_edges, __global const vec *restrict row_phases,
-    const int first, const int n_images, __global const real *restrict column_roots,
-    __global const real *restrict image_column_roots, SCRATCH vec *restrict scratch)
+    __global const real *restrict steps, const int first, const int n_images,
+    __global const real *restrict column_roots, __global const real *restrict image_column_roots,
+    SCRATCH vec *restrict scratch)
 {
     spectra += (size_t)first * SPECTRA_SIZE;
     otfs += (size_t)first * PIXELS_SIZE;
     otf_edges += 2 * first * NY;
-    FOR_EACH_BLOCK(block, COLUMN_BLOCKS) {
+    FOR_EACH_BLOCK_IF(steps[FRESH], block, COLUMN_BLOCKS) {
         __global vec *columns = spectra + (size_t)block * ROWS * 2 * SIDE;
         SCRATCH_OF(scratch, columns);
         for (int image = 0; image < n_images; ++image) {

@@ -109,9 +109,30 @@ typedef PASTE(BITS, WIDTH) ivec;
 #define PREFETCH(p) prefetch(p, 1)
 #endif
 
+/* The numbers that a run has on the device, of what its solver has decided: `steps`. */
+enum {
+    GOING,        /* whether it goes on */
+    FRESH,        /* whether this tick has a new estimate */
+    RECORDED,     /* objectives recorded */
+    TARGET,       /* as many end it for now */
+    TOLERANCE,    /* the relative change an iteration at which it has settled */
+    ROUNDING,     /* a rise of the objective, as a share of it, that may be rounding */
+    REASON,       /* why it has ended: see decide.cl */
+    ALPHA,        /* the last step */
+    LENGTH,       /* the last Barzilai-Borwein step */
+    IS_FIRST,     /* whether no step was made yet */
+    SHARE,        /* the share of the step that is tried; 0 where none is, as at a start */
+    SHORTENED,    /* how often it was shortened */
+    SLOPE,        /* its slope */
+    PRIOR_CHANGE, /* and the change of the term of the stars' prior */
+};
+
 /* Shares n blocks among however many work-groups were launched. */
 #define FOR_EACH_BLOCK(block, n) \
     for (int block = get_group_id(0); block < (n); block += get_num_groups(0))
+
+/* The same, but nothing where a number of a run is 0: so a tick is a branch where it has ended. */
+#define FOR_EACH_BLOCK_IF(number, block, n) FOR_EACH_BLOCK(block, (number) != 0 ? (n) : 0)
 
 /* Shares n pieces of work among the work-items of a group. All items do the same number of rounds:
  * PoCL 3 miscompiles loops round barriers whose bounds differ between the items.

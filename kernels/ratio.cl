@@ -162,6 +162,7 @@ INLINE void compare(
  * star_corners: [n_stars][n_images][2]; star_near: the stars of each block, see stars.cl.
  * star_fluxes: [n_stars].
  * ratio_sums: [IMAGE_ROW_BLOCKS][n_images][2]. star_sums: [n_stars][n_images][star_blocks][2].
+ * steps[GOING] 0: nothing.
  * Launch: up to IMAGE_ROW_BLOCKS n_images groups. In place. Scratch: NX points, and where
  * OVERSAMPLE > 1 IMAGE_NX more.
  * Twin: reference.ratio_rows.
@@ -172,12 +173,13 @@ KERNEL void ratio_rows(
     __global const real *restrict background, __global const vec *restrict exposure,
     __global const vec *restrict star_images, __global const int *restrict star_corners,
     __global const int *restrict star_near, __global const real *restrict star_fluxes,
-    const int n_images, const int star_blocks, const int star_columns,
-    __global const real *restrict image_row_roots, SCRATCH vec *restrict scratch)
+    __global const real *restrict steps, const int n_images, const int star_blocks,
+    const int star_columns, __global const real *restrict image_row_roots,
+    SCRATCH vec *restrict scratch)
 {
     SHARED_SUMS(shared);
     SCRATCH vec *wide = OWN_SCRATCH(scratch, NX + (OVERSAMPLE > 1 ? IMAGE_NX : 0));
-    FOR_EACH_BLOCK(unit, IMAGE_ROW_BLOCKS * n_images) {
+    FOR_EACH_BLOCK_IF(steps[GOING], unit, IMAGE_ROW_BLOCKS * n_images) {
         const int block = unit / n_images, image = unit % n_images;
         __global vec *row_spectra = spectra + (size_t)image * SPECTRA_SIZE;
         read_tiles(wide, row_spectra, block);

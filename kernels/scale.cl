@@ -18,25 +18,29 @@ INLINE cvec inverse_weight_at(
 
 /* f <- f (1 + a u) / (1 + (mu + curvature) f a), u = c + curvature f - slope,
  * c = sum_j A_j^T (r_j - w_j), a = 1 / sum_j A_j^T w_j, and 1 + a u not below 0;
- * spectra <- row spectrum of the new f; square_sums: sum f^2; c_s <- c_s star_corrections_s.
+ * spectra <- row spectrum of the new f; square_sums: sum f^2; the stars, with p_s = star_weights_s:
+ * c_s <- c_s (p_s star_corrections_s + q_s c0_s) / (p_s + q_s c_s), by the prior (c0_s, q_s).
  * spectra: one array, in: row spectrum of c, out: twice the row spectrum of f.
  * extended: one array of pixels, f. inverse_weight: one array of pixels, a (HAS_WEIGHTS; else
  * a = 1 / n_images). slope, curvature: one array of pixels each, const, those of f
  * (HAS_SMOOTHING; else they count as 0). square_sums: [ROW_BLOCKS][2] (HAS_MU).
- * star_fluxes, star_corrections: [n_stars].
+ * star_fluxes, star_corrections, star_weights, prior_fluxes, prior_precision: [n_stars].
+ * steps[GOING] 0: nothing.
  * Launch: up to ROW_BLOCKS groups. In place. Scratch: NX points. Twin: reference.scale_rows.
  */
 KERNEL void scale_rows(
     __global vec *restrict spectra, __global vec *restrict extended,
     __global real *restrict square_sums, __global real *restrict star_fluxes,
     __global const vec *restrict inverse_weight, __global const real *restrict star_corrections,
-    __global const vec *restrict slope, __global const vec *restrict curvature, const real mu,
+    __global const real *restrict star_weights, __global const real *restrict prior_fluxes,
+    __global const real *restrict prior_precision, __global const vec *restrict slope,
+    __global const vec *restrict curvature, __global const real *restrict steps, const real mu,
     const int n_images, const int n_stars, __global const real *restrict row_roots,
     SCRATCH vec *restrict scratch)
 {
     SHARED_SUMS(shared);
     SCRATCH vec *z = OWN_SCRATCH(scratch, NX);
-    FOR_EACH_BLOCK(block, ROW_BLOCKS) {
+    FOR_EACH_BLOCK_IF(steps[GOING], block, ROW_BLOCKS) {
         const size_t at = (size_t)block * NX * 2 * SIDE;
         __global vec *source = extended + at;
         read_tiles(z, spectra, block);
@@ -83,7 +87,10 @@ KERNEL void scale_rows(
         write_tiles(spectra, z, block, 1);
     }
     if (get_group_id(0) == 0) {
-        FOR_EACH(s, n_stars)
-            star_fluxes[s] *= star_corrections[s];
+        FOR_EACH(s, steps[GOING] != 0 ? n_stars : 0) {
+            const real flux = star_fluxes[s], known = prior_precision[s] / star_weights[s];
+            star_fluxes[s] =
+                flux * (star_corrections[s] + known * prior_fluxes[s]) / (1 + known * flux);
+        }
     }
 }

@@ -86,20 +86,21 @@ INLINE vec psi(const vec t, const real delta)
  * curvature = the same sum of psi'(t) / t; smooth_sums: the sum of (beta + beta') / 2 psi over all pairs.
  * extended: one array of pixels, const, f. slope, curvature: one array of pixels each, written.
  * smoothing_map: one array of pixels, const, beta (HAS_SMOOTHING_MAP; else beta is the number
- * smoothing). smooth_sums: [ROW_BLOCKS][2]. edge: delta.
+ * smoothing). smooth_sums: [ROW_BLOCKS][2]. edge: delta. steps[GOING] 0: nothing.
  * Launch: up to ROW_BLOCKS groups. Out of place. Twin: reference.smooth.
  */
 KERNEL void smooth(
     __global vec *restrict slope, __global vec *restrict curvature,
     __global real *restrict smooth_sums, __global const vec *restrict extended,
-    __global const vec *restrict smoothing_map, const real smoothing, const real edge)
+    __global const vec *restrict smoothing_map, __global const real *restrict steps,
+    const real smoothing, const real edge)
 {
     SHARED_SUMS(shared);
     __global const real *pixels = (__global const real *)extended;
 #if HAS_SMOOTHING_MAP
     __global const real *weights = (__global const real *)smoothing_map;
 #endif
-    FOR_EACH_BLOCK(block, ROW_BLOCKS) {
+    FOR_EACH_BLOCK_IF(steps[GOING], block, ROW_BLOCKS) {
         const size_t at = (size_t)block * NX * 2 * SIDE;
         vec_sum total = {0, 0};
         FOR_EACH(piece, NX * SIDE) {

@@ -46,7 +46,7 @@ INLINE vec next_gradient(const vec correction, const vec f, const vec slope, con
  * spectra: one array, const, row spectrum of c. gradient: one array of pixels, updated. extended
  * (f), previous, shift: one each, const. inverse_weight: one array of pixels, a (HAS_WEIGHTS; else
  * a = 1 / n_images). slope, curvature: one array of pixels each, const, those of f (HAS_SMOOTHING;
- * else they count as 0). change_sums: [ROW_BLOCKS][2][2].
+ * else they count as 0). change_sums: [2][ROW_BLOCKS][2]. steps[FRESH] 0: nothing.
  * Launch: up to ROW_BLOCKS groups. In place. Scratch: NX points. Twin: reference.gradient_rows.
  */
 KERNEL void gradient_rows(
@@ -54,12 +54,12 @@ KERNEL void gradient_rows(
     __global vec *restrict gradient, __global const vec *restrict extended,
     __global const vec *restrict previous, __global const vec *restrict shift,
     __global const vec *restrict inverse_weight, __global const vec *restrict slope,
-    __global const vec *restrict curvature, const real mu, const int n_images,
-    __global const real *restrict row_roots, SCRATCH vec *restrict scratch)
+    __global const vec *restrict curvature, __global const real *restrict steps, const real mu,
+    const int n_images, __global const real *restrict row_roots, SCRATCH vec *restrict scratch)
 {
     SHARED_SUMS(shared);
     SCRATCH vec *z = OWN_SCRATCH(scratch, NX);
-    FOR_EACH_BLOCK(block, ROW_BLOCKS) {
+    FOR_EACH_BLOCK_IF(steps[FRESH], block, ROW_BLOCKS) {
         const size_t at = (size_t)block * NX * 2 * SIDE;
         read_tiles(z, spectra, block);
         dit_inner(z, NX, row_roots);
@@ -83,59 +83,78 @@ KERNEL void gradient_rows(
             ACCUMULATE(change_change, change.re * change.re + change.im * change.im);
             STORE(gradient + at + lane, pixel, next);
         }
-        store_pair(change_sums + 4 * block, sum_group(sum_lanes(change_step), shared));
-        store_pair(change_sums + 4 * block + 2, sum_group(sum_lanes(change_change), shared));
+        store_pair(change_sums + 2 * block, sum_group(sum_lanes(change_step), shared));
+        store_pair(
+            change_sums + 2 * (ROW_BLOCKS + block), sum_group(sum_lanes(change_change), shared));
         BARRIER;
     }
 }
 
-/* d = P(f - alpha D gradient) - f, P the projection on f >= 0; extended = f + share d;
- * spectra <- row spectrum of extended; step_sums: <gradient, d>;
- * coupling_sums: <cross_information_s, d>; square_sums: sum extended^2.
- * spectra: one array, out: twice the row spectrum. extended: one array of pixels, written.
- * previous (f), gradient, shift: one each, const; inverse_weight, curvature: as for gradient_rows,
- * which has D. cross_information: [n_stars], a window of cross_blocks blocks and cross_columns
+/* previous = f; f <- f + d, d = P(f - alpha D gradient) - f, P the projection on f >= 0; where the
+ * last step was refused f <- previous + SHORTER (f - previous) instead, which shortens d.
+ * spectra <- row spectrum of f; step_sums: <gradient, d>;
+ * coupling_sums: <cross_information_s, d>; square_sums: sum f^2.
+ * spectra: one array, out: twice the row spectrum. extended (f): one array of pixels, updated.
+ * previous: one, written, or read. gradient, shift: one each, const; inverse_weight, curvature: as
+ * for gradient_rows, which has D and change_sums. steps[GOING] 0: nothing. cross_information: [n_stars], a window of cross_blocks blocks and cross_columns
  * columns each; cross_corners: [n_stars][2]; cross_near: the stars of each block, see stars.cl.
  * coupling_sums: [n_stars][cross_blocks][2].
  * step_sums, square_sums (HAS_MU): [ROW_BLOCKS][2].
- * Launch: up to ROW_BLOCKS groups. Out of place. Scratch: NX points. Twin: reference.step_rows.
+ * Launch: up to ROW_BLOCKS groups. In place. Scratch: NX points. Twin: reference.step_rows.
  */
 KERNEL void step_rows(
     __global vec *restrict spectra, __global vec *restrict extended,
     __global real *restrict step_sums, __global real *restrict coupling_sums,
-    __global real *restrict square_sums, __global const vec *restrict previous,
+    __global real *restrict square_sums, __global vec *restrict previous,
     __global const vec *restrict gradient, __global const vec *restrict shift,
     __global const vec *restrict inverse_weight, __global const vec *restrict curvature,
     __global const vec *restrict cross_information, __global const int *restrict cross_corners,
-    __global const int *restrict cross_near, const real mu, const real alpha, const real share,
-    const int n_images, const int cross_blocks, const int cross_columns,
-    __global const real *restrict row_roots, SCRATCH vec *restrict scratch)
+    __global const int *restrict cross_near, __global const real *restrict steps,
+    __global const real *restrict change_sums, const real mu, const int n_images,
+    const int cross_blocks, const int cross_columns, __global const real *restrict row_roots,
+    SCRATCH vec *restrict scratch)
 {
     SHARED_SUMS(shared);
     SCRATCH vec *z = OWN_SCRATCH(scratch, NX);
-    FOR_EACH_BLOCK(block, ROW_BLOCKS) {
+    const real alpha = next_alpha(steps, next_length(steps, change_sums, shared));
+    const bool is_new = steps[SHORTENED] == 0;
+    FOR_EACH_BLOCK_IF(steps[GOING], block, ROW_BLOCKS) {
         const size_t at = (size_t)block * NX * 2 * SIDE;
         const bool has_stars = cross_near[block] < cross_near[block + 1];
         vec_sum slope_total = {0, 0}, square_total = {0, 0};
         /* A pass of its own over the pixels in their order, which prefetching follows: inside the
          * transform they come from too many places at once.
          */
-        FOR_EACH(piece, NX * SIDE) {
+        FOR_EACH(piece, is_new ? NX * SIDE : 0) {
             const int pixel = piece / SIDE, lane = piece % SIDE;
-            const cvec f = LOAD(previous + at + lane, pixel);
+            const cvec f = LOAD(extended + at + lane, pixel);
             const cvec g = LOAD(gradient + at + lane, pixel);
             const cvec scale =
                 scaling_at(f, shift, inverse_weight, curvature, at + lane, pixel, mu, n_images);
-            const cvec d = {
-                not_below_0(f.re - alpha * scale.re * g.re) - f.re,
-                not_below_0(f.im - alpha * scale.im * g.im) - f.im
+            const cvec trial = {
+                not_below_0(f.re - alpha * scale.re * g.re),
+                not_below_0(f.im - alpha * scale.im * g.im)
             };
-            /* f + d is not below 0 but for rounding. */
-            const cvec trial = {not_below_0(f.re + share * d.re), not_below_0(f.im + share * d.im)};
+            const cvec d = {trial.re - f.re, trial.im - f.im};
+            STORE(previous + at + lane, pixel, f);
             STORE(extended + at + lane, pixel, trial);
             ACCUMULATE(slope_total, g.re * d.re + g.im * d.im);
             if (has_stars)
                 STORE(z + lane, pixel, d);
+#if HAS_MU
+            ACCUMULATE(square_total, trial.re * trial.re + trial.im * trial.im);
+#endif
+        }
+        FOR_EACH(piece, is_new ? 0 : NX * SIDE) {
+            const int pixel = piece / SIDE, lane = piece % SIDE;
+            const cvec before = LOAD(previous + at + lane, pixel);
+            const cvec f = LOAD(extended + at + lane, pixel);
+            const cvec trial = {
+                before.re + SHORTER * (f.re - before.re), before.im + SHORTER * (f.im - before.im)
+            };
+            STORE(extended + at + lane, pixel, trial);
+            if (has_stars) /* which know how they follow */
+                STORE(z + lane, pixel, trial);
 #if HAS_MU
             ACCUMULATE(square_total, trial.re * trial.re + trial.im * trial.im);
 #endif

@@ -2,17 +2,17 @@
 
 /* spectra_j = 2 sum_x t_j(x) f(x) exp(-2 pi i k x / NX): the row spectra of the sky of each image.
  * extended: one array of pixels, f, const. transmission: n_images arrays of pixels, const.
- * spectra: n_images arrays, all of them but their padding is written.
+ * spectra: n_images arrays, all of them but their padding is written. steps[GOING] 0: nothing.
  * Launch: up to ROW_BLOCKS groups. Out of place. Scratch: NX points.
  * Twin: reference.transmit_rows.
  */
 KERNEL void transmit_rows(
     __global vec *restrict spectra, __global const vec *restrict extended,
-    __global const vec *restrict transmission, const int n_images,
-    __global const real *restrict row_roots, SCRATCH vec *restrict scratch)
+    __global const vec *restrict transmission, __global const real *restrict steps,
+    const int n_images, __global const real *restrict row_roots, SCRATCH vec *restrict scratch)
 {
     SCRATCH vec *z = OWN_SCRATCH(scratch, NX);
-    FOR_EACH_BLOCK(block, ROW_BLOCKS) {
+    FOR_EACH_BLOCK_IF(steps[GOING], block, ROW_BLOCKS) {
         const size_t at = (size_t)block * NX * 2 * SIDE;
         for (int image = 0; image < n_images; ++image) {
             __global const vec *t = transmission + (size_t)image * PIXELS_SIZE + at;
@@ -36,17 +36,17 @@ KERNEL void transmit_rows(
 
 /* spectra_0 <- row spectrum of sum_j t_j c_j, with c_j that of spectra_j: the adjoint.
  * spectra: n_images arrays, of which array 0 alone is written. transmission: as above.
- * transmitted: one array of pixels, for sums so far.
+ * transmitted: one array of pixels, for sums so far. steps[FRESH] 0: nothing.
  * Launch: up to ROW_BLOCKS groups. In place. Scratch: NX points. Twin: reference.gather_rows.
  */
 KERNEL void gather_rows(
     __global vec *restrict spectra, __global vec *restrict transmitted,
-    __global const vec *restrict transmission, const int n_images,
-    __global const real *restrict row_roots, SCRATCH vec *restrict scratch)
+    __global const vec *restrict transmission, __global const real *restrict steps,
+    const int n_images, __global const real *restrict row_roots, SCRATCH vec *restrict scratch)
 {
     const real norm = (real)1 / 2 / NX;
     SCRATCH vec *z = OWN_SCRATCH(scratch, NX);
-    FOR_EACH_BLOCK(block, ROW_BLOCKS) {
+    FOR_EACH_BLOCK_IF(steps[FRESH], block, ROW_BLOCKS) {
         const size_t at = (size_t)block * NX * 2 * SIDE;
         for (int image = 0; image < n_images; ++image) {
             __global const vec *t = transmission + (size_t)image * PIXELS_SIZE + at;

@@ -66,17 +66,18 @@ INLINE int in_row(const int x)
  * in the steps of larger pixels, or the adjoint.
  * sampled, given: arrays [parts][stride][length] of vectors, of which lines, a multiple of RUN, are
  * taken; of the const one that of a number is read. firsts: [..][lines], 0 to lines - 1, and weights,
- * [..][lines][TURN_TAPS]: from line `table` on.
+ * [..][lines][TURN_TAPS]: from line `table` on. Here and in the kernels below steps[GOING] 0: nothing.
  * Launch: up to parts * lines / RUN groups. Out of place. Twin: reference.sample_lines.
  */
 KERNEL void sample_lines(
     __global vec *restrict sampled, __global const vec *restrict given, const int array,
-    __global const int *restrict firsts, __global const real *restrict weights, const int table,
-    const int parts, const int lines, const int stride, const int length)
+    __global const int *restrict firsts, __global const real *restrict weights,
+    __global const real *restrict steps, const int table, const int parts, const int lines,
+    const int stride, const int length)
 {
     const int runs = lines / RUN;
     given += (size_t)array * parts * stride * length;
-    FOR_EACH_BLOCK(run, parts * runs) {
+    FOR_EACH_BLOCK_IF(steps[GOING], run, parts * runs) {
         const size_t part = (size_t)(run / runs) * stride * length;
         FOR_EACH(piece, RUN * length) {
             const int line = run % runs * RUN + piece / length, place = piece % length;
@@ -135,11 +136,12 @@ INLINE void load_columns(
  * Launch: up to count * ROW_BLOCKS groups. Out of place. Scratch: NX points. Twin: reference.irfft_sheared.
  */
 KERNEL void irfft_sheared(
-    __global real *restrict columns, __global const vec *restrict spectra, const int image,
-    const int count, __global const real *restrict row_roots, SCRATCH vec *restrict scratch)
+    __global real *restrict columns, __global const vec *restrict spectra,
+    __global const real *restrict steps, const int image, const int count,
+    __global const real *restrict row_roots, SCRATCH vec *restrict scratch)
 {
     SCRATCH vec *z = OWN_SCRATCH(scratch, 2 * TURN_POINTS);
-    FOR_EACH_BLOCK(unit, count * ROW_BLOCKS) {
+    FOR_EACH_BLOCK_IF(steps[GOING], unit, count * ROW_BLOCKS) {
         const int block = unit % ROW_BLOCKS, place = unit / ROW_BLOCKS;
         __global real *own = columns + place * COLUMNS_SIZE;
         read_tiles(z, spectra + (size_t)(image + place) * SPECTRA_SIZE, block);
@@ -175,14 +177,15 @@ KERNEL void ratio_sheared(
     __global const vec *restrict images, __global const real *restrict background,
     __global const vec *restrict exposure, __global const vec *restrict star_images,
     __global const int *restrict star_corners, __global const int *restrict star_near,
-    __global const real *restrict star_fluxes, const int n_images, const int star_blocks,
-    const int star_columns, SCRATCH vec *restrict scratch)
+    __global const real *restrict star_fluxes, __global const real *restrict steps,
+    const int n_images, const int star_blocks, const int star_columns,
+    SCRATCH vec *restrict scratch)
 {
     SHARED_SUMS(shared);
     SCRATCH vec *sheared = OWN_SCRATCH(scratch, 2 * TURN_POINTS);
     SCRATCH vec *wide = sheared + 2 * SIDE * TURN_POINTS;
     SCRATCH vec *z = wide + 2 * SIDE * TURN_MARGIN;
-    FOR_EACH_BLOCK(unit, count * image_blocks) {
+    FOR_EACH_BLOCK_IF(steps[GOING], unit, count * image_blocks) {
         const int block = unit % image_blocks, place = unit / image_blocks, turn = image + place;
         __global const vec *w =
             image_weights + ((size_t)turn * IMAGE_ROW_BLOCKS + block) * TURN_TAPS * 2 * SIDE;
@@ -240,10 +243,10 @@ KERNEL void ratio_sheared(
 KERNEL void unshear_columns(
     __global real *restrict columns, __global const real *restrict ratio_columns,
     __global const int *restrict column_shifts, __global const real *restrict column_weights,
-    const int image, SCRATCH vec *restrict scratch)
+    __global const real *restrict steps, const int image, SCRATCH vec *restrict scratch)
 {
     SCRATCH vec *z = OWN_SCRATCH(scratch, 2 * TURN_POINTS);
-    FOR_EACH_BLOCK(block, ROW_BLOCKS) {
+    FOR_EACH_BLOCK_IF(steps[GOING], block, ROW_BLOCKS) {
         load_columns(
             z, ratio_columns, column_shifts + image * NX, column_weights + image * NX * TURN_TAPS,
             block, -1, 0);
@@ -263,11 +266,11 @@ KERNEL void unshear_columns(
 KERNEL void rfft_sheared(
     __global vec *restrict spectra, __global const real *restrict ratio_columns,
     __global const int *restrict column_shifts, __global const real *restrict column_weights,
-    const int image, const int count, __global const real *restrict row_roots,
-    SCRATCH vec *restrict scratch)
+    __global const real *restrict steps, const int image, const int count,
+    __global const real *restrict row_roots, SCRATCH vec *restrict scratch)
 {
     SCRATCH vec *z = OWN_SCRATCH(scratch, 2 * TURN_POINTS);
-    FOR_EACH_BLOCK(unit, count * ROW_BLOCKS) {
+    FOR_EACH_BLOCK_IF(steps[GOING], unit, count * ROW_BLOCKS) {
         const int block = unit % ROW_BLOCKS, place = unit / ROW_BLOCKS, turn = image + place;
         load_columns(
             z, ratio_columns + place * COLUMNS_SIZE, column_shifts + turn * NX,

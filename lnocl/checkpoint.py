@@ -13,11 +13,11 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
+from lnocl.core.engines.engine import State
 from lnocl.core.runs.held_out import HeldOutCounts
 from lnocl.core.runs.inputs import WIDTH, digest_of
 from lnocl.core.runs.run import Run
 from lnocl.core.runs.stopping import Rule
-from lnocl.core.solvers.engine import State
 from lnocl.errors import FileError, InputError, warn
 from lnocl.io.atomic import check_output, whole_file
 

@@ -189,7 +189,7 @@ def deconvolve(
         (`lnocl.core.scene.zero_points`); the image in the middle keeps its own. A line of the log
         and the plan of the result say what was mended.
     checkpoint : str or path, optional
-        File for the state of the run (FITS), saved after the first iteration, every minute and at
+        File for the state of the run (FITS), saved after the first iterations, every minute and at
         the end.
 
         Each checkpoint replaces the one before once it is complete. With held-out counts it holds

@@ -71,7 +71,7 @@ def reconstruct(
             prior = told_prior(told)
             penalties = [replace(penalty, stars=prior) for penalty in penalties]
         if stop == "held-out":
-            held_out = HeldOutCounts(start, penalties, n_iter)
+            held_out = HeldOutCounts(start, penalties, n_iter, n_iter if callback is None else 1)
             outcome = _choose(held_out, callback, progress, checkpointer)
             if outcome.stop_reason != "held-out" or not held_out.finds_no_end:
                 return outcome
@@ -147,7 +147,9 @@ def _iterate(
 ) -> str:
     """Iterate to the end, saving checkpoints; return why it ended."""
     quantity = partial(rule.quantity, run)
-    stop_reason = None
+    stop_reason, run.tolerance = None, rule.tolerance
+    if callback is not None or rule.looks:
+        run.stride = 1
     for iteration in run:
         if _is_ended(callback, iteration, run):
             stop_reason = "callback"
@@ -158,7 +160,6 @@ def _iterate(
             break
         save("")
     stop_reason = stop_reason or ("n_iter" if run.done == run.n_iter else "converged")
-    run.finish()
     run.check_descent()
     if stop_reason in ("n_iter", "converged"):
         rule.miss(run)

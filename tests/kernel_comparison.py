@@ -16,6 +16,8 @@ from numpy.typing import ArrayLike, NDArray
 from lnocl.core import reference
 from lnocl.core.opencl.layout import reversed_order
 from lnocl.core.opencl.shears import Shears
+from lnocl.core.reference.decide import next_step
+from lnocl.core.scene.steps import Steps
 from lnocl.errors import DeviceError
 
 # What a kernel made, and what its twin made of the same.
@@ -414,77 +416,186 @@ def _run_collect_sums(harness: KernelHarness, given: SimpleNamespace) -> Pairs:
     star_sums = rounded(star_sums, harness.dtype)
     square_sums = rounded(rng.random((blocks, 2)), harness.dtype)
     smooth_sums = rounded(rng.random((blocks, 2)), harness.dtype)
-    objective, corrections = _twin(
-        reference.collect_sums,
-        given,
-        objective=ratio_sums.sum(),
-        squares=square_sums.sum(),
-        smoothness=smooth_sums.sum() if given.smoothing else 0.0,
-        star_sums=star_sums.sum(axis=(1, 2)),
-    )
-    objectives, data_term = harness.put(np.full((3, 2), -1.0)), harness.put(np.zeros(2))
-    star_totals = harness.put(np.zeros((given.n, 2)))
-    star_corrections = harness.put(np.zeros(given.n))
-    _launch(
-        harness,
-        given,
-        "collect_sums",
-        objectives=objectives,
-        data_term=data_term,
-        star_totals=star_totals,
-        star_corrections=star_corrections,
-        ratio_sums=harness.put(ratio_sums),
-        star_sums=harness.put(star_sums),
-        square_sums=harness.put(square_sums),
-        smooth_sums=harness.put(smooth_sums),
-        star_blocks=star_blocks,
-        iteration=1,
-    )
-    found = harness.take(objectives, (3, 2)).astype(float)
-    yield found.sum(axis=1), np.array([-2.0, objective, -2.0])
-    yield harness.take(data_term, -1).sum(), ratio_sums.sum()
-    yield _take_star_sums(harness, given, star_totals), star_sums.sum(axis=(1, 2))
-    yield harness.take(star_corrections, -1), corrections
+    sums = {
+        "objective": ratio_sums.sum(),
+        "squares": square_sums.sum(),
+        "smoothness": smooth_sums.sum() if given.smoothing else 0.0,
+        "star_sums": star_sums.sum(axis=(1, 2)),
+    }
+    objective = sums["objective"] + 0.5 * given.mu * sums["squares"] + sums["smoothness"]
+    put = {
+        "ratio_sums": ratio_sums,
+        "star_sums": star_sums,
+        "square_sums": square_sums,
+        "smooth_sums": smooth_sums,
+    }
+    for steps, before in _judged(objective, harness.dtype):
+        numbers, record = harness.put(steps.numbers()), np.full((len(before) + 2, 2), -1.0)
+        record[: len(before)] = np.transpose([before, np.zeros(len(before))])
+        expected = list(before)
+        with np.errstate(invalid="ignore"):  # as runs do
+            corrections = _twin(
+                reference.collect_sums, given, steps=steps, objectives=expected, **sums
+            )
+        objectives, data_term = harness.put(record), harness.put(np.zeros(2))
+        star_totals = harness.put(np.zeros((given.n, 2)))
+        star_corrections = harness.put(np.zeros(given.n))
+        _launch(
+            harness,
+            given,
+            "collect_sums",
+            steps=numbers,
+            objectives=objectives,
+            data_term=data_term,
+            star_totals=star_totals,
+            star_corrections=star_corrections,
+            star_blocks=star_blocks,
+            **{name: harness.put(values) for name, values in put.items()},
+        )
+        found = harness.take(objectives, record.shape).astype(float)
+        ahead = [-2.0] * (len(record) - len(expected))
+        yield found.sum(axis=1), np.array([*expected, *ahead])
+        yield from _steps(harness.take(numbers, -1), steps)
+        yield harness.take(data_term, -1).sum(), ratio_sums.sum()
+        yield _take_star_sums(harness, given, star_totals), sums["star_sums"]
+        yield harness.take(star_corrections, -1), corrections
+
+
+def _judged(objective: float, dtype: np.dtype) -> Iterator[tuple[Steps, list[float]]]:
+    """Yield what was decided before an objective, and the objectives before it."""
+
+    def own(**numbers: float) -> Steps:
+        return Steps(*rounded(Steps(**numbers).numbers(), dtype).tolist())
+
+    above = list(rounded([objective + 2.0, objective + 1.0], dtype))
+    below = list(rounded([objective + 1.0, objective - 1.0], dtype))
+    settling = list(rounded(objective + 1e-3 * np.arange(12.0, 0.0, -1.0), dtype))
+    step = {"share": 1.0, "slope": -100.0, "recorded": 2.0}
+    yield own(), []
+    yield own(recorded=2.0, target=3.0), above
+    yield own(**step, target=3.0, shortened=2.0), above
+    yield own(**step), below
+    yield own(**step, shortened=11.0), below
+    yield own(**step, shortened=11.0, prior_change=math.inf), above
+    # What it is allowed is no number.
+    yield own(**{**step, "slope": -math.inf}, rounding=math.inf, shortened=11.0), above
+    yield own(**step, prior_change=-3.0), below
+    yield own(**step, rounding=0.1 + 1.0 / abs(objective)), below
+    yield own(**{**step, "slope": -1e5}), above
+    yield own(**step, going=0.0), above
+    many = {**step, "recorded": 12.0, "slope": -1e-9}
+    yield own(**many, tolerance=1.1e-3 / abs(objective)), settling
+    yield own(**many, tolerance=0.9e-3 / abs(objective)), settling
+    yield own(**{**many, "recorded": 10.0}, tolerance=1.0), settling[2:]
+
+
+def _run_follow_stars(harness: KernelHarness, given: SimpleNamespace) -> Pairs:
+    rng, n, blocks = np.random.default_rng(8), given.n, given.cross_windows.n_blocks
+    root = rng.normal(size=(n, 2 * n))
+    inverse = rounded(root @ root.T + np.eye(n), harness.dtype)
+    inverse = np.triu(inverse) + np.triu(inverse, 1).T
+    coupling = rounded(rng.uniform(-1.0, 2.0, (n, blocks, 2)), harness.dtype)
+    change = rounded(rng.normal(size=n), harness.dtype)
+    change_sums = rounded(rng.uniform(1.0, 2.0, (2, harness.program.row_blocks, 2)), harness.dtype)
+    for pull, slope, numbers in (
+        (-0.3, -1.0, {}),
+        (0.2, -1.0, {"is_first": 0.0, "length": 0.3}),
+        (-1.5, -1.0, {"is_first": 0.0, "length": 9.0}),
+        (-0.3, 1e4, {"is_first": 0.0}),
+        (0.1, -1.0, {"is_first": 0.0, "shortened": 2.0, "share": 0.16, "slope": -3.0}),
+        (0.1, -1.0, {"going": 0.0}),
+    ):
+        steps = Steps(*rounded(Steps(**numbers).numbers(), harness.dtype).tolist())
+        totals = rounded(rng.uniform(0.1, 0.2, (n, 2)) - pull, harness.dtype)
+        slopes = rounded(np.full((harness.program.row_blocks, 2), slope), harness.dtype)
+        kept = harness.put([given.star_fluxes, change, change, change])
+        there = _launch(
+            harness,
+            given,
+            "follow_stars",
+            steps=harness.put(steps.numbers()),
+            star_steps=kept,
+            star_totals=harness.put(totals),
+            coupling_sums=harness.put(coupling),
+            star_inverse=harness.put(inverse),
+            step_sums=harness.put(slopes),
+            change_sums=harness.put(change_sums),
+            cross_blocks=blocks,
+        )
+        fluxes, changed = given.star_fluxes, change
+        if steps.going:
+            fluxes, changed = reference.follow_stars(
+                steps,
+                given.star_fluxes,
+                change,
+                totals.sum(axis=1),
+                coupling.sum(axis=(1, 2)),
+                inverse,
+                given.prior_fluxes,
+                given.prior_precision,
+                slopes.sum(),
+                next_step(steps, *change_sums.sum(axis=(1, 2))),
+            )
+        if n:
+            found = harness.take(there["star_fluxes"], -1), *harness.take(kept, (4, n))[:2]
+            yield np.array(found), np.array([fluxes, given.star_fluxes, changed])
+        yield from _steps(harness.take(there["steps"], -1), steps)
+
+
+def _steps(found: NDArray, expected: Steps) -> Pairs:
+    """Yield the numbers of a run one by one, but the last, which is small, with its slope."""
+    pairs = np.nan_to_num([found.astype(float), expected.numbers()], posinf=1e30)
+    yield from pairs[:, :-1].T
+    yield pairs[0, -2:], pairs[1, -2:]
 
 
 def _run_gradient_rows(harness: KernelHarness, given: SimpleNamespace) -> Pairs:
     expected, change_step, change_change = _twin(
         reference.gradient_rows, given, row_spectrum=given.correction_spectra
     )
-    spectra, sums = harness.put_spectra(given.correction_spectra), harness.empty_sums(2)
+    spectra = harness.put_spectra(given.correction_spectra)
+    sums = harness.put(np.full((2, harness.program.row_blocks, 2), np.nan))
     there = _launch(harness, given, "gradient_rows", spectra=spectra, change_sums=sums)
     yield harness.take_pixels(there["gradient"]), expected
-    yield harness.take_sums(sums, 2), np.array([change_step, change_change])
+    found = harness.take(sums, (2, -1)).astype(float).sum(axis=1)
+    yield found, np.array([change_step, change_change])
 
 
 def _run_step_rows(harness: KernelHarness, given: SimpleNamespace) -> Pairs:
-    alpha, windows = float(np.float32(1.3)), given.cross_windows
-    for share in (1.0, float(np.float32(0.4))):
-        extended, spectrum, squares, slope, couplings = _twin(
-            reference.step_rows, given, alpha=alpha, share=share
-        )
-        out, trial = harness.empty_spectra(), harness.empty_pixels()
-        sums, square_sums = harness.empty_sums(), harness.empty_sums()
+    windows, sums = given.cross_windows, np.zeros((2, harness.program.row_blocks, 2))
+    sums[:, :, 0] = rounded(np.array([[1.3], [0.9]]) / harness.program.row_blocks, harness.dtype)
+    for numbers in ({"alpha": float(np.float32(1.3))}, {"is_first": 0.0}, {"shortened": 1.0}):
+        steps = Steps(**numbers)
+        alpha, _ = next_step(steps, *sums.sum(axis=(1, 2)))
+        before = given.previous if steps.shortened else given.extended
+        if steps.shortened:
+            made = [*reference.shortened(given.extended, given.previous), None, None]
+        else:
+            made = _twin(reference.step_rows, given, alpha=alpha)
+        extended, spectrum, squares, slope, couplings = made
+        out, step_sums, square_sums = (
+            harness.empty_spectra(), harness.empty_sums(), harness.empty_sums()
+        )  # fmt: skip
         coupling_sums = harness.put(np.full((given.n, windows.n_blocks, 2), np.nan))
-        _launch(
+        there = _launch(
             harness,
             given,
             "step_rows",
             spectra=out,
-            extended=trial,
-            step_sums=sums,
+            step_sums=step_sums,
             coupling_sums=coupling_sums,
             square_sums=square_sums,
-            previous=harness.put_pixels(given.extended),
             cross_information=harness.put_windows(given.cross_information, windows),
             **_put_windows(harness, "cross", windows),
-            alpha=alpha,
-            share=share,
+            steps=harness.put(steps.numbers()),
+            change_sums=harness.put(sums),
         )
-        yield harness.take_pixels(trial), extended
+        yield harness.take_pixels(there["extended"]), extended
+        yield harness.take_pixels(there["previous"]), before
         yield harness.take_spectra(out), spectrum
-        yield harness.take_sums(sums, 1), np.array([slope])
-        yield _take_star_sums(harness, given, coupling_sums), couplings
+        if slope is not None:
+            yield harness.take_sums(step_sums, 1), np.array([slope])
+            yield _take_star_sums(harness, given, coupling_sums), couplings
         if given.mu:
             yield harness.take_sums(square_sums, 1), np.array([squares])
 

@@ -19,6 +19,7 @@ from lnocl.core.opencl.tuning import Tuning
 from lnocl.core.opencl.windows import stars_near
 from lnocl.core.scene.rotation import Rotation
 from lnocl.core.scene.scene import MIN_MODEL
+from lnocl.core.scene.steps import Steps
 from lnocl.errors import DeviceError
 
 # Scenes with all parts, together, that a program can have.
@@ -202,7 +203,7 @@ class KernelHarness:
         Arguments that the scene has no use for are small arrays.
         """
         counts = {"n_images": self.n_images, "n_stars": self.n_stars, "first": 0}
-        given = {**counts, **arguments}
+        given = {**counts, "steps": self.put(Steps().numbers()), **arguments}
         for name in self.program.arguments[kernel]:
             if name not in given and name not in self.launcher.own:
                 given[name] = self.put(np.zeros(2))
@@ -353,6 +354,8 @@ def inputs(harness: KernelHarness) -> SimpleNamespace:
         star_fluxes=own(rng.uniform(0.1, 1.0, n)),
         star_weights=own(rng.uniform(1.0, 2.0, n)),
         star_corrections=own(rng.uniform(0.9, 1.1, n)),
+        prior_fluxes=own(rng.uniform(0.1, 1.0, n)),
+        prior_precision=own(rng.uniform(0.5, 1.0, n)),
         extended=own(rng.random((1, ny, nx))),
         correction_spectra=own(np.fft.rfft(rng.uniform(-4.0, 8.0, (1, ny, nx)), axis=-1) / nx),
         inverse_weight=(

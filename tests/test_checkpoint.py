@@ -154,7 +154,7 @@ def test_held_out_counts_go_on_from_their_last_checkpoint(engine, tmp_path, monk
         os.remove(path)
         written.clear()
         with pytest.raises(KeyboardInterrupt):
-            made.deconvolve(**given)
+            made.deconvolve(**given, callback=lambda *_: None)
         iterated.clear()
         found = made.deconvolve(**given, resume=path, callback=lambda k, _: iterated.append(k))
         assert_same(found, whole)
@@ -177,7 +177,7 @@ def test_they_are_written_first_then_when_it_is_time_and_at_the_end(
     monkeypatch.setattr(checkpoint, "write", lambda *given: written.append(given))
     monkeypatch.setattr(checkpoint, "EVERY", every)
     given = {"n_iter": 5, "engine": "numpy", "checkpoint": str(tmp_path / "run.fits")}
-    STARS.make().deconvolve(**given)
+    STARS.make().deconvolve(**given, callback=lambda *_: None)
     assert len(written) == times
     assert [ended for _, _, ended, *_ in written] == [""] * (times - 1) + ["n_iter"]
 
@@ -258,6 +258,9 @@ def test_nothing_truncated_or_altered_is_gone_on_from(share, saved, tmp_path):
             read = checkpoint.read(str(path))
         except lnocl.FileError:
             refused += 1
+            continue
+        if read.described["version"] != sound.described["version"]:
+            refused += 1  # as that of another version
             continue
         # A comment, or padding.
         assert (read.described, read.ended) == (sound.described, sound.ended)
@@ -384,6 +387,6 @@ def test_a_full_disk_stops_no_run_that_has_come_far(written, tmp_path, monkeypat
             STARS.make().deconvolve(**given)
         return
     with pytest.warns(lnocl.LnoclWarning, match="No space left on device; the run continues"):
-        found = STARS.make().deconvolve(**given)
+        found = STARS.make().deconvolve(**given, callback=lambda *_: None)
     assert found.n_iter == 5
     assert checkpoint.read(path).arrays["progress"][0] == written

@@ -150,9 +150,7 @@ def _reconstruct(
     """Return extended source, star fluxes and objectives of a run."""
     setup = Setup(case.observation, case.stars, 0, solver, precision, engine, device)
     made = Run(make_start(setup, case.penalty), n_iter)
-    for _ in made:
-        pass
-    made.finish()
+    made.complete()
     return made.extended(), made.star_fluxes(), made.objectives()
 
 

@@ -154,7 +154,7 @@ class TestDeconvolve:
     def test_a_run_that_ends_at_once_is_said(self, n_iter, capsys, monkeypatch):
         """But not where one iteration was asked for."""
         if n_iter > 1:
-            monkeypatch.setattr("lnocl.core.solvers.sgp.SUFFICIENT", 1e9)  # no step is enough
+            monkeypatch.setattr("lnocl.core.reference.decide.SUFFICIENT", 1e9)  # no step is enough
         run("--solver", "sgp", "--n-iter", str(n_iter))
         said = "it ended after 0 iterations: there is little but noise" in capsys.readouterr().out
         assert said == (n_iter > 1)

@@ -65,7 +65,7 @@ BAD_ARGUMENTS = {
     "--noise rms": "argument --noise: 'rms' is not KIND=FILE",
     "--mask dq:16": "a.fits has no extension DQ; give --mask as a file, or",
     "--n-iter 1.5": "argument --n-iter: invalid int value: '1.5'",
-    "--n-iter 3000000000": "--n-iter must be 2147483646 at most; 3000",
+    "--n-iter 3000000000": "--n-iter must be 16777214 at most; 3000",
     "--stop 2": "--stop 2.0 is not known; give held-out, discrepancy, none",
     "--pad -1": "--pad must be a whole number, 0 or more, or auto; -1 was given",
     "--pad 5000": "with --pad 5000 need a grid of (10016, 10012); the largest axis is 8192",

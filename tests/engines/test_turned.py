@@ -180,9 +180,7 @@ def test_images_that_are_launched_together(maps):
         engine = OpenCLEngine(scene, "single", None, 20, tuning)
         engine.start(*scene.start(None, None))
         for _ in range(8):
-            engine.ratio()
-            engine.correct()
-            engine.scale()
+            engine.tick()
         found.append(engine)
     assert worst(found[1].extended(), found[0].extended()) <= 3e-6
     assert worst(found[1].objectives(), found[0].objectives()) <= 3e-6

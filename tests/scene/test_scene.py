@@ -213,7 +213,7 @@ REFUSED = [
     ({"mu": 10**400}, "mu must be a number, finite and not negative; 1000"),
     ({"mu": 1e30}, "mu 1e+30 is too large for images of about"),
     ({"smoothing": 1e30}, "smoothing 1e+30 is too large for images of"),
-    ({"n_iter": 10**400}, "n_iter must be 2147483646 at most; 1000"),
+    ({"n_iter": 10**400}, "n_iter must be 16777214 at most; 1000"),
     ({"mu": None, "stop": "held-out"}, "mu must be a number, finite and not negative; None"),
     ({"pad": MAX_AXIS // 2}, "with pad=4096 need a grid of (8200, 8208)"),
     ({"initial_extended": np.ones((8, 15))}, "initial_extended has shape"),

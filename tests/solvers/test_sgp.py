@@ -5,6 +5,7 @@ differences of gradients and amplify rounding, in 20 iterations by 1e4: to round
 compared early, and at the minimum.
 """
 
+import dataclasses
 import functools
 
 import numpy as np
@@ -330,13 +331,18 @@ def test_engines_agree(precision, name):
 # --- How it ends
 
 
+def refuse(engine):
+    """Have an engine refuse each step, however far the objective falls."""
+    engine._steps = dataclasses.replace(engine.look(), rounding=-1e30)
+
+
 @every_engine
-def test_estimate_is_the_last_good_one_where_no_step_is_left(engine, monkeypatch):
+def test_estimate_is_the_last_good_one_where_no_step_is_left(engine):
     name = ON_DEVICE
 
-    def refuse_all_steps(iteration, _):
+    def refuse_all_steps(iteration, estimate):
         if iteration == 3:
-            monkeypatch.setattr("lnocl.core.solvers.sgp.SUFFICIENT", 1e300)
+            refuse(estimate._run.engine)
 
     expected = run(name, n_iter=3, **engine)
     result = run(name, n_iter=9, callback=refuse_all_steps, **engine)
@@ -389,14 +395,20 @@ def test_a_shortened_step_has_the_scaling_of_its_base():
         reference.ReferenceEngine(scene, steps),
     ):
         engine.start(start[0], fluxes)
-        engine.ratio()
-        engine.correct()
-        engine.gradient()
-        for share in (1.0, 0.4):
-            engine.step(3.0, share)
-            engine.ratio()
+        refuse(engine)
+        engine.go_on(2, 0.0)
+        for _ in range(3):
+            engine.tick()
+        assert engine.look().shortened == 3
         found.append(engine.extended())
-    assert worst(*found) <= 6e-7  # measured 1.9e-7
+        engine._steps = dataclasses.replace(engine.look(), rounding=1e30)
+        engine.go_on(3, 0.0)
+        for _ in range(2):
+            engine.tick()
+        assert engine.look().recorded == 3
+        found.append(engine.extended())
+    assert worst(found[0], found[2]) <= 2.4e-7  # measured 7.7e-8
+    assert worst(found[1], found[3]) <= 3e-6  # measured 1.07e-6
 
 
 # --- Rounding

@@ -35,7 +35,7 @@ def targets(tmp_path, monkeypatch):
     for k in range(N_TARGETS):
         fits.writeto(f"i{k}.fits", np.random.default_rng(k).poisson(made.images).astype(float))
         (x, y) = made.stars[0]
-        rows.append((f"i{k}.fits", "psfs.fits", f"{x},{y}", "given", 60, "none", 0.01, 0))
+        rows.append((f"i{k}.fits", "psfs.fits", f"{x},{y}", "given", 400, "none", 0.01, 0))
     rows[4] = ("gone.fits", *rows[4][1:])
     names = ["images", "psf", "star", "psf_centre", "n_iter", "stop", "smoothing", "psf_error"]
     Table(rows=rows, names=names).write("targets.csv")

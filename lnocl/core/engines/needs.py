@@ -11,8 +11,10 @@ from lnocl.core.opencl.memory import held_bytes
 from lnocl.core.opencl.program import Program
 from lnocl.core.opencl.windows import StarWindows
 from lnocl.core.scene.scene import Scene
+from lnocl.core.scene.steps import Steps
 from lnocl.core.solvers.scaling import Scaling
 
+N_STEPS = len(Steps().numbers())
 # Bytes, half of those that PoCL's compiler takes in a first run: later ones find its kernels.
 COMPILER = 40 * 2**20
 # Estimates of both halves of the counts that are held (`lnocl.core.runs.halves`).
@@ -50,6 +52,9 @@ def buffer_sizes(
         "smoothing_map": pixels if scene.smoothing_map is not None else item,
         "smooth_sums": program.row_blocks * pair,
         "objectives": (n_iter + 1) * pair,
+        "steps": N_STEPS * item,
+        "prior_fluxes": max(n, 1) * item,
+        "prior_precision": max(n, 1) * item,
         "row_phases": item,
         "transmission": p * pixels if scene.transmission is not None else item,
         "transmitted": pixels if scene.transmission is not None else item,
@@ -66,6 +71,8 @@ def scaling_sizes(
         "gradient": pixels,
         "shift": pixels,
         "change_sums": program.row_blocks * 4 * item,
+        "star_inverse": max(scene.n_fluxes, 1) ** 2 * item,
+        "star_steps": max(scene.n_fluxes, 1) * 4 * item,
         "step_sums": program.row_blocks * 2 * item,
         **cross_sizes(scene, program, cross),
     }

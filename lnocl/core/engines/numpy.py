@@ -2,23 +2,25 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
+from lnocl.core.engines.engine import State
 from lnocl.core.reference.convolve import convolve_columns, correlate_columns, otf_columns
+from lnocl.core.reference.decide import collect_sums, follow_stars, next_step
 from lnocl.core.reference.ratio import ratio_rows
 from lnocl.core.reference.rows import ComplexArray, rfft_rows
 from lnocl.core.reference.scale import scale_rows
 from lnocl.core.reference.smooth import smooth
-from lnocl.core.reference.step import gradient_rows, step_rows
-from lnocl.core.reference.sums import collect_sums
+from lnocl.core.reference.step import gradient_rows, shortened, step_rows
 from lnocl.core.reference.transmit import gather_rows, transmit_rows
 from lnocl.core.reference.turn import irfft_sheared, ratio_sheared, unshear_columns
 from lnocl.core.scene.arrays import Array
 from lnocl.core.scene.forward_model import Model
 from lnocl.core.scene.scene import Scene
-from lnocl.core.solvers.engine import State
+from lnocl.core.scene.steps import STUCK, Steps
 from lnocl.core.solvers.scaling import Scaling
 
 
@@ -34,13 +36,13 @@ class ReferenceEngine:
     """
 
     name = "numpy"
-    rounding = 0.0
 
     def __init__(self, scene: Scene, scaling: Scaling | None = None) -> None:
         self.scene, self.scaling = scene, scaling
         if scaling is not None:
             self.set_scaling(scaling)
         self.take_images()
+        self._objectives: list[float] = []
         background = scene.background()
         self._background = background if background.ndim == 3 else background[:, None, None]
         self._otfs = np.array([otf_columns(rfft_rows(scene.psf(j))) for j in range(scene.n_images)])
@@ -54,16 +56,15 @@ class ReferenceEngine:
         self._slope = self._curvature = np.zeros(scene.grid)
 
     def take_images(self) -> None:
-        """Take the images that the scene has now, all else being as it was; forget the record."""
+        """Take the images that the scene has now, all else being as it was."""
         self._images = np.array(list(self.scene.images()))
-        self._objectives: list[float] = []
-        self._n_fetched = 0
 
     def set_scaling(self, scaling: Scaling) -> None:
         """Measure steps with this from now on."""
         self.scaling, self._shift = scaling, scaling.shift
         cutouts = [cutout.on_grid(self.scene.grid) for cutout in scaling.cross_information]
         self._cross_information = np.array(cutouts).reshape(len(cutouts), *self.scene.grid)
+        self._star_inverse = scaling.star_information.solve(np.eye(len(cutouts)))
 
     def move_stars(self) -> None:
         """Put the stars where the scene has them now."""
@@ -80,17 +81,49 @@ class ReferenceEngine:
         observed = self.scene.observed(total)
         return np.divide(1.0, total, out=np.zeros_like(total), where=observed)
 
-    def start(self, extended: Array, star_fluxes: Array) -> None:
-        """Begin from this estimate, on the grid and scaled; unobserved pixels are set to 0."""
+    def start(self, extended: Array, star_fluxes: Array, recorded: int = 0) -> None:
+        """Begin from this estimate, with so many objectives on the record; add its own."""
         self._extended = np.where(np.asarray(self._inverse_weight) > 0, extended, 0.0)
         self._star_fluxes = star_fluxes.copy()
+        self._previous = self._extended
+        self._gradient, self._changes = np.zeros_like(self._extended), [0.0, 0.0]
+        self._objectives = self._objectives[:recorded]
+        self._judge_estimate(Steps(recorded=recorded))
+        self._make_gradient()
+
+    def _judge_estimate(self, steps: Steps) -> None:
+        """Make the ratios of an estimate from elsewhere, and record its objective."""
+        self._steps, self._prior = steps, self.scene.prior_of_fluxes()
+        self._before, self._change = self._star_fluxes, np.zeros_like(self._star_fluxes)
         self._row_spectrum = rfft_rows(self._extended)
         self._squares = float((self._extended**2).sum())
-        self._previous = self._extended
-        self._gradient = np.zeros_like(self._extended)
+        self._ratio()
 
-    def ratio(self) -> None:
-        """Make the ratios of the estimate; record its objective."""
+    def go_on(self, target: int, tolerance: float) -> None:
+        """Let ticks go on until so many objectives are recorded, or have settled."""
+        self._steps = replace(self._steps, going=1.0, fresh=1.0, target=target, tolerance=tolerance)
+
+    def tick(self) -> None:
+        """Iterate once: make a step, or one shorter than the last, which was refused."""
+        if not self._steps.going:
+            return
+        if self.scaling is None:
+            self._correct()
+            self._scale()
+            self._ratio()
+            return
+        self._step()
+        self._ratio()
+        self._make_gradient()
+
+    def look(self) -> Steps:
+        """Return what was decided."""
+        if self._steps.reason == STUCK:
+            self._extended, self._star_fluxes = self._previous, self._before
+        return self._steps
+
+    def _ratio(self) -> None:
+        """Make the ratios of the estimate; judge its objective."""
         skies = self._row_spectrum
         if (transmission := self.scene.transmission) is not None:
             skies = transmit_rows(self._extended, transmission)
@@ -117,7 +150,9 @@ class ReferenceEngine:
                 self.scene.smoothing if weights is None else weights,
                 self.scene.edge,
             )
-        objective, self._star_corrections = collect_sums(
+        self._star_corrections = collect_sums(
+            self._steps,
+            self._objectives,
             self._data_term,
             self._squares,
             smoothness,
@@ -125,7 +160,6 @@ class ReferenceEngine:
             self.scene.star_weights,
             self.scene.mu,
         )
-        self._objectives.append(objective)
 
     def _ratio_turned(self, row_spectra: ComplexArray, observed: tuple[Any, ...]) -> None:
         """Make the ratios of images that are turned, in the steps of their pixels."""
@@ -146,7 +180,7 @@ class ReferenceEngine:
         for j, (rows, _) in sampled.items():
             self._ratio_row_spectra[j] = rows.adjoint(self._ratio_row_spectra[j], 0)
 
-    def correct(self) -> None:
+    def _correct(self) -> None:
         """Back-project the ratios to the correction."""
         spectra, otfs, phases = self._ratio_row_spectra, self._otfs, self._phases
         if (transmission := self.scene.transmission) is None:
@@ -159,7 +193,7 @@ class ReferenceEngine:
         ]
         self._row_spectrum = gather_rows(np.array(back), transmission)
 
-    def scale(self) -> None:
+    def _scale(self) -> None:
         """Scale the estimate by its correction."""
         self._extended, self._row_spectrum, self._squares, self._star_fluxes = scale_rows(
             self._row_spectrum,
@@ -168,13 +202,18 @@ class ReferenceEngine:
             self.scene.mu,
             self._star_fluxes,
             self._star_corrections,
+            self.scene.star_weights,
+            *self._prior,
             self._slope,
             self._curvature,
         )
 
-    def gradient(self) -> tuple[float, float]:
-        """Take the estimate for the base of steps; return ``<D y, s>`` and ``<D y, D y>``."""
-        self._gradient, change_step, change_change = gradient_rows(
+    def _make_gradient(self) -> None:
+        """Make the gradient of a new estimate, and how it has changed."""
+        if self.scaling is None or not self._steps.fresh:
+            return
+        self._correct()
+        self._gradient, *self._changes = gradient_rows(
             self._row_spectrum,
             self._extended,
             self._previous,
@@ -185,40 +224,42 @@ class ReferenceEngine:
             self._slope,
             self._curvature,
         )
-        self._previous, self._base_curvature = self._extended, self._curvature
-        return change_step, change_change
 
-    def star_gradient(self) -> Array:
-        """Return the gradient of the objective in the star fluxes."""
-        return -self._star_sums
-
-    def step(self, alpha: float, share: float) -> tuple[float, Array]:
-        """Step from the base; return ``<gradient, d>`` and ``<c_s, d>``; see `step_rows`."""
-        self._extended, self._row_spectrum, self._squares, slope, coupling = step_rows(
-            self._previous,
-            self._gradient,
-            self._shift,
-            self._inverse_weight,
-            self._cross_information,
-            self.scene.mu,
-            alpha,
-            share,
-            self._base_curvature,
+    def _step(self) -> None:
+        """Make a step from the estimate, or shorten it; let the stars follow."""
+        steps, slope, coupling = self._steps, 0.0, np.zeros(0)
+        length = next_step(steps, *self._changes)
+        if steps.shortened:
+            trial, self._row_spectrum, self._squares = shortened(self._extended, self._previous)
+        else:
+            self._before = self._star_fluxes
+            trial, self._row_spectrum, self._squares, slope, coupling = step_rows(
+                self._extended,
+                self._gradient,
+                self._shift,
+                self._inverse_weight,
+                self._cross_information,
+                self.scene.mu,
+                length[0],
+                self._curvature,
+            )
+            self._previous = self._extended
+        self._extended = trial
+        self._star_fluxes, self._change = follow_stars(
+            steps,
+            self._before,
+            self._change,
+            self._star_sums,
+            coupling,
+            self._star_inverse,
+            *self._prior,
+            slope,
+            length,
         )
-        return slope, coupling
-
-    def set_star_fluxes(self, star_fluxes: Array) -> None:
-        """Make these the star fluxes."""
-        self._star_fluxes = star_fluxes.copy()
 
     def objective(self) -> float:
         """Return the objective recorded last."""
         return self._objectives[-1]
-
-    def forget_objective(self) -> None:
-        """Take the objective recorded last off the record."""
-        self._objectives.pop()
-        self._n_fetched = min(self._n_fetched, len(self._objectives))
 
     def extended(self) -> Array:
         """Return the extended source, on the grid and scaled."""
@@ -229,35 +270,33 @@ class ReferenceEngine:
         return self._star_fluxes.copy()
 
     def data_term(self) -> float:
-        """Return the data term of the objective recorded last, scaled."""
+        """Return the data term of the last tick's estimate, scaled."""
         return self._data_term
 
-    def objectives(self) -> Array:
-        """Return the objectives recorded so far, scaled."""
-        return np.array(self._objectives)
-
-    def fetched_objectives(self) -> list[float]:
-        """Return the objectives recorded since the last call, scaled."""
-        fetched, self._n_fetched = self._objectives[self._n_fetched :], len(self._objectives)
-        return fetched
+    def objectives(self, first: int = 0) -> Array:
+        """Return the objectives recorded, from one on, scaled."""
+        return np.array(self._objectives[first:])
 
     def state(self) -> State:
-        """Return the arrays from which `restore` continues between iterations."""
-        return {
+        """Return the arrays from which `restore` continues."""
+        state = {
             "extended": self._extended,
             "star_fluxes": self._star_fluxes,
-            "square_sums": np.array([self._squares]),
             "objectives": self.objectives(),
-            "previous": self._previous,
-            "gradient": self._gradient,
+            "steps": self._steps.numbers(),
         }
+        if self.scaling is None:
+            return state
+        changes = {"previous": self._previous, "gradient": self._gradient}
+        return state | changes | {"change_sums": np.array(self._changes)}
 
     def restore(self, state: State) -> None:
         """Continue from this state."""
-        self._extended, self._previous = state["extended"], state["previous"]
-        self._gradient = state["gradient"]
-        self._star_fluxes = state["star_fluxes"]
-        self._row_spectrum = rfft_rows(self._extended)
-        self._squares = float(state["square_sums"][0])
-        self._objectives = state["objectives"].tolist()
-        self._n_fetched = len(self._objectives)
+        steps = Steps(*state["steps"].tolist())
+        self._extended, self._star_fluxes = state["extended"], state["star_fluxes"]
+        self._objectives = state["objectives"].tolist()[:-1]
+        self._judge_estimate(replace(Steps(), recorded=len(self._objectives)))
+        self._steps = steps
+        if self.scaling is not None:
+            self._previous, self._gradient = state["previous"], state["gradient"]
+            self._changes = state["change_sums"].tolist()

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
+from dataclasses import replace
 
 import numpy as np
 import pyopencl as cl
 from numpy.typing import NDArray
 
+from lnocl.core.engines.engine import State
 from lnocl.core.engines.needs import (
+    N_STEPS,
     buffer_sizes,
     cross_sizes,
     has_background_map,
@@ -19,7 +22,7 @@ from lnocl.core.opencl.device import choose, context_of, describe, tell
 from lnocl.core.opencl.faults import guarded
 from lnocl.core.opencl.launch import Launch, Launcher
 from lnocl.core.opencl.layout import Layout
-from lnocl.core.opencl.memory import Memory, Transfer, announce, refuse_if_too_large
+from lnocl.core.opencl.memory import Memory, announce, refuse_if_too_large
 from lnocl.core.opencl.program import Program
 from lnocl.core.opencl.transmitted import TransmittedSky
 from lnocl.core.opencl.tuning import Tuning, describe_tuning
@@ -29,26 +32,21 @@ from lnocl.core.scene.arrays import Array
 from lnocl.core.scene.camera import spread
 from lnocl.core.scene.scene import MIN_MODEL, Scene
 from lnocl.core.scene.stars import covered_box
-from lnocl.core.solvers.engine import State
+from lnocl.core.scene.steps import STUCK, Steps
 from lnocl.core.solvers.scaling import Scaling
 
-# The host waits once in so many iterations, for those before them: often enough that an interrupt
-# is answered soon, seldom enough that the device never waits for the host.
-ITERATIONS_AHEAD = 4
-# And looks at the objectives once in so many, at those of as many before: a transfer costs the host
-# as much as launching an iteration.
-FETCH_EVERY = 64
 # What the images hold where a pixel was not observed.
 UNSEEN = -1.0
+# The prior of fluxes, and what steps leave for the next, by the names of buffers.
+PRIOR = "prior_fluxes", "prior_precision"
+CHANGES = "previous", "gradient", "change_sums"
 # Share of the objective that single precision may round a step's fall by: 8e-7 and less were seen.
 ROUNDING = 3e-7
 
 
 @guarded
 class OpenCLEngine:
-    """A scene on a device.
-
-    Every estimate is convolved as soon as it is made: the host waits for sums of steps meanwhile.
+    """A scene on a device, which decides by itself how an iteration goes on.
 
     Parameters
     ----------
@@ -63,7 +61,7 @@ class OpenCLEngine:
     tuning : Tuning, optional
         By default that of `lnocl.core.opencl.tuning.tune`.
     scaling : Scaling, optional
-        For the scaled gradient projection method, whose verbs need it.
+        For the scaled gradient projection method.
     half : {0, 1}, optional
         Which half of the counts the scene is of, where both are on the device.
 
@@ -87,7 +85,7 @@ class OpenCLEngine:
         half: int | None = None,
     ) -> None:
         self.name, self.bytes_needed = "the device", 0
-        self._forget_record()
+        self.is_proven = self._has_ticked = False  # every kernel of an iteration was launched
         choice = choose(device)
         tell(choice)
         chosen = choice.device
@@ -108,7 +106,7 @@ class OpenCLEngine:
             has_turns=bool(scene.rotations),
             min_model=MIN_MODEL,
         )
-        self.rounding = ROUNDING if precision == "single" else 0.0
+        self._first = Steps(rounding=ROUNDING) if precision == "single" else Steps()
         self.layout = Layout(self.program)
         self._turned = self._turned_images()
         self._stars = StarWindows(
@@ -143,7 +141,6 @@ class OpenCLEngine:
         self._queue = self._launcher.queue
         self._memory = Memory(self._queue, self.layout, scene.scale)
         self._observed: NDArray[np.bool_] | None = None
-        self._star_fluxes: Array | None = None  # as they are on the device, where that is known
         self._memory.allocate(**sizes)
         self._upload_scene()
         self._bind_iteration()
@@ -158,11 +155,6 @@ class OpenCLEngine:
     def _spacing(self) -> int:
         """Pixels of an image here to one of the scene's: turned images lie on pixels of the sky."""
         return self.program.image_grid[0] // self.scene.image_grid[0]
-
-    @property
-    def is_proven(self) -> bool:
-        """Whether every kernel of an iteration has been launched."""
-        return self._n_objectives > self._n_restored + 1
 
     @property
     def _observed_blocks(self) -> int:
@@ -188,9 +180,6 @@ class OpenCLEngine:
             "mu": scene.mu,
             "smoothing": scene.smoothing,
             "edge": scene.edge,
-            "iteration": 0,
-            "alpha": 0.0,
-            "share": 0.0,
             "image": 0,
             "first": 0,
             "image_blocks": self._observed_blocks,
@@ -202,12 +191,13 @@ class OpenCLEngine:
         self._convolve: Callable[[], object] = self._bind("convolve_columns")
         self._correlate: Callable[[], object] = self._bind("correlate_columns")
         if self.scene.transmission is not None:
-            seen = TransmittedSky(self._bind, self._memory, self.scene.n_images)
+            seen = TransmittedSky(self._bind, self.scene.n_images)
             self._convolve, self._correlate = seen.convolve, seen.correlate
         if self._turned:
             self._turned.bind(self._bind, self._memory, self._queue)
+            self._compare: Callable[[], object] = self._turned.make_ratios
         else:
-            self._ratio = self._bind("ratio_rows")
+            self._compare = self._bind("ratio_rows")
         if self.scene.is_smoothed:
             self._smooth = self._bind("smooth")
         self._collect = self._bind("collect_sums")
@@ -215,6 +205,7 @@ class OpenCLEngine:
 
     def _upload_scene(self) -> None:
         scene, memory = self.scene, self._memory
+        self._set(Steps())
         if self._turned:
             self._turned.upload(memory)
         memory.clear("star_sums")  # in images that do not show a star they stay 0
@@ -243,18 +234,9 @@ class OpenCLEngine:
         return self._turned.laid(laid) if self._turned else laid
 
     def take_images(self) -> None:
-        """Take the images that the scene has now, all else being as it was; forget the record."""
+        """Take the images that the scene has now, all else being as it was."""
         beside = 0.0 if self.scene.has_exposure_map else UNSEEN
         self._memory.upload_pixels("images", self._laid(self._marked_images(), beside))
-        self._forget_record()
-
-    def _forget_record(self) -> None:
-        self._n_objectives = self._n_restored = 0
-        self._pending_objective: Transfer | None = None
-        self._n_scaled = 0
-        self._last_mark: cl.Event | None = None
-        self._unchecked: Transfer | None = None
-        self._fetched: list[float] = []
 
     def _marked_images(self) -> Iterator[Array]:
         """Yield the images; `UNSEEN` is not observed, unless a map of exposures marks that."""
@@ -279,8 +261,10 @@ class OpenCLEngine:
         )
         self._memory.upload_integers("cross_corners", self._cross.corners)
         self._memory.upload_integers("cross_near", self._cross.near)
-        self._gradient = self._bind("gradient_rows")
-        self._step = self._bind("step_rows")
+        inverse = scaling.star_information.solve(np.eye(self.scene.n_fluxes))
+        self._memory.upload("star_inverse", inverse)
+        self._gradient, self._step = self._bind("gradient_rows"), self._bind("step_rows")
+        self._follow = self._bind("follow_stars")
 
     def move_stars(self) -> None:
         """Put the stars where the scene has them now."""
@@ -331,119 +315,79 @@ class OpenCLEngine:
         inverse = np.divide(1.0, total, out=np.zeros_like(total), where=self._observed)
         self._memory.upload_pixels("inverse_weight", [inverse])
 
-    def start(self, extended: Array, star_fluxes: Array) -> None:
-        """Begin from this estimate, on the grid and scaled; unobserved pixels are set to 0."""
+    def start(self, extended: Array, star_fluxes: Array, recorded: int = 0) -> None:
+        """Begin from this estimate, with so many objectives on the record; add its own."""
         memory = self._memory
         if self._observed is not None:
             extended = np.where(self._observed, extended, 0.0)
         memory.upload_pixels("extended", [extended])
-        self._transform_estimate()
-        self.set_star_fluxes(star_fluxes)
+        memory.upload("star_fluxes", star_fluxes)
         squares = np.zeros(memory.count("square_sums"))
         squares[0] = np.einsum("yx,yx->", extended, extended)
         memory.upload("square_sums", squares)
+        self._judge_estimate(replace(self._first, recorded=recorded))
         if self.scaling is not None:
             memory.copy("extended", "previous")
             memory.clear("gradient")
+            self._correlate()
+            self._gradient()
 
-    def ratio(self) -> None:
-        """Make the ratios of the estimate; record its objective."""
-        if self._turned:
-            self._turned.make_ratios()
-        else:
-            self._ratio()
-        if self.scene.is_smoothed:
-            self._smooth_buffer("extended")
-        self._collect.set(iteration=self._n_objectives)
-        self._collect()
-        self._n_objectives += 1
-        # Steps are judged by it: it is sent for before the work that need not wait for it.
-        self._pending_objective = None if self.scaling is None else self._fetch_objective()
-
-    def _smooth_buffer(self, name: str) -> None:
-        """Make the slope and the curvature of these pixels."""
-        self._smooth.set(extended=self._memory.buffers[name])
-        self._smooth()
-
-    def correct(self) -> None:
-        """Back-project the ratios to the correction."""
-        self._correlate()
-
-    def scale(self) -> None:
-        """Scale the estimate by its correction; fetch the objectives of some iterations ago."""
-        event = self._scale()
+    def _judge_estimate(self, steps: Steps) -> None:
+        """Make the ratios of an estimate that came from the host, and record its objective."""
+        self._set(steps)
+        for name, values in zip(PRIOR, self.scene.prior_of_fluxes(), strict=True):
+            self._memory.upload(name, values)
+        self._bind("rfft_rows", pixels=self._memory.buffers["extended"])()
         self._convolve()
-        self._star_fluxes = None
-        self._n_scaled += 1
-        if self._n_scaled % ITERATIONS_AHEAD == 0:
-            if self._last_mark is not None:
-                self._last_mark.wait()
-            self._last_mark = event
-        if self._n_scaled % FETCH_EVERY == 0:
-            if self._unchecked is not None:
-                self._fetched = self._unchecked.wait()[0].reshape(-1, 2).sum(axis=1).tolist()
-            first = 2 * (self._n_objectives - FETCH_EVERY)
-            self._unchecked = self._memory.fetch_ranges(("objectives", first, 2 * FETCH_EVERY))
+        self._ratio()
 
-    def gradient(self) -> tuple[float, float]:
-        """Take the estimate for the base of steps; return ``<D y, s>`` and ``<D y, D y>``."""
-        self._gradient()
-        pairs = self._memory.download("change_sums", self._memory.count("change_sums"))
-        change_step, change_change = pairs.reshape(-1, 2, 2).sum(axis=(0, 2))
-        self._make_estimate_the_base()
-        return float(change_step), float(change_change)
+    def _set(self, steps: Steps) -> None:
+        self._steps, self._is_known = steps, True
+        self._memory.upload_raw("steps", steps.numbers().astype(self.program.dtype))
 
-    def _make_estimate_the_base(self) -> None:
-        """Exchange the estimate and the one before it, over which the next one is written."""
-        buffers = self._memory.buffers
-        self._memory.exchange("extended", "previous")
-        for launch in (self._gradient, self._step):
-            launch.set(extended=buffers["extended"], previous=buffers["previous"])
+    def _ratio(self) -> None:
+        """Make the ratios of the estimate; judge its objective."""
+        self._is_known = False
+        self._compare()
+        if self.scene.is_smoothed:
+            self._smooth()
+        self._collect()
 
-    def star_gradient(self) -> Array:
-        """Return the gradient of the objective in the star fluxes."""
-        if not self.scene.n_fluxes:
-            return np.zeros(0)  # without waiting for the device
-        return -self._wait_for_objective()[1]
+    def go_on(self, target: int, tolerance: float) -> None:
+        """Let ticks go on until so many objectives are recorded, or have settled."""
+        going = {"going": 1.0, "fresh": 1.0, "target": target, "tolerance": tolerance}
+        self._set(replace(self._steps, **going))
 
-    def step(self, alpha: float, share: float) -> tuple[float, Array]:
-        """Step from the base; return ``<gradient, d>`` and ``<cross_information_s, d>``."""
-        if self.scene.is_smoothed and share < 1:  # the curvature is that of a longer step by now
-            self._smooth_buffer("previous")
-        self._step.set(alpha=float(alpha), share=float(share))
+    def tick(self) -> None:
+        """Iterate once: make a step, or one shorter than the last, which was refused."""
+        self.is_proven, self._has_ticked = self._has_ticked, True
+        if self.scaling is None:
+            self._correlate()
+            self._scale()
+            self._convolve()
+            self._ratio()
+            return
         self._step()
-        transfer = self._memory.fetch("step_sums", "coupling_sums")
-        self._convolve()  # which the host need not wait for
-        slope, couplings = transfer.wait()
-        n = self.scene.n_fluxes
-        return float(slope.sum()), couplings.reshape(n, -1).sum(axis=1) if n else np.zeros(0)
+        self._follow()
+        self._convolve()
+        self._ratio()
+        self._correlate()
+        self._gradient()
 
-    def set_star_fluxes(self, star_fluxes: Array) -> None:
-        """Make these the star fluxes."""
-        self._star_fluxes = self._memory.upload("star_fluxes", star_fluxes)
+    def look(self) -> Steps:
+        """Return what was decided; this waits for all ticks."""
+        if self._is_known:
+            return self._steps
+        self._is_known = True
+        self._steps = Steps(*self._memory.download("steps", N_STEPS).tolist())
+        if self._steps.reason == STUCK:
+            self._memory.copy("previous", "extended")
+            self._memory.copy("star_steps", "star_fluxes")
+        return self._steps
 
     def objective(self) -> float:
         """Return the objective recorded last, scaled."""
-        return self._wait_for_objective()[0]
-
-    def _wait_for_objective(self) -> tuple[float, Array]:
-        """Return the objective recorded last, and ``sum_j <P_js, r_j - w_j>``."""
-        if self._pending_objective is None:
-            self._pending_objective = self._fetch_objective()
-        objective, stars = self._pending_objective.wait()
-        star_sums = stars.reshape(-1, 2).sum(axis=1)[: self.scene.n_fluxes]
-        return float(objective.sum()), star_sums
-
-    def _fetch_objective(self) -> Transfer:
-        return self._memory.fetch_ranges(
-            ("objectives", 2 * (self._n_objectives - 1), 2),
-            ("star_totals", 0, self._memory.count("star_totals")),
-        )
-
-    def forget_objective(self) -> None:
-        """Take the objective recorded last off the record."""
-        self._n_objectives -= 1
-        self._pending_objective = None
+        return float(self.objectives(int(self._steps.recorded) - 1)[-1])
 
     def extended(self) -> Array:
         """Return the extended source, on the grid and scaled."""
@@ -451,49 +395,34 @@ class OpenCLEngine:
 
     def star_fluxes(self) -> Array:
         """Return the star fluxes, scaled."""
-        if self._star_fluxes is None:
-            self._star_fluxes = self._memory.download("star_fluxes", self.scene.n_fluxes)
-        return self._star_fluxes.copy()
+        return self._memory.download("star_fluxes", self.scene.n_fluxes)
 
     def data_term(self) -> float:
         """Return the data term of the objective recorded last, scaled."""
         return float(self._memory.download("data_term", 2).sum())
 
-    def objectives(self) -> Array:
-        """Return the objectives recorded so far, scaled."""
-        pairs = self._memory.download("objectives", 2 * self._n_objectives)
-        return pairs.reshape(-1, 2).sum(axis=1)
-
-    def fetched_objectives(self) -> list[float]:
-        """Return the objectives that `scale` has fetched since the last call, scaled."""
-        fetched, self._fetched = self._fetched, []
-        return fetched
+    def objectives(self, first: int = 0) -> Array:
+        """Return the objectives recorded, from one on, scaled."""
+        pairs = self._memory.download("objectives", 2 * int(self.look().recorded))
+        return pairs.reshape(-1, 2)[first:].sum(axis=1)
 
     def state(self) -> State:
         """Return the arrays that `restore` needs, between iterations, as they lie on the device."""
+        recorded = int(self.look().recorded)
         state = {name: self._memory.download_raw(name) for name in self._stateful}
-        state["objectives"] = state["objectives"].reshape(-1, 2)[: self._n_objectives]
+        state["objectives"] = state["objectives"].reshape(-1, 2)[:recorded]
         state["star_fluxes"] = state["star_fluxes"][: self.scene.n_fluxes]
         return state
 
     @property
     def _stateful(self) -> tuple[str, ...]:
-        estimate = "extended", "star_fluxes", "square_sums", "objectives"
-        return estimate if self.scaling is None else (*estimate, "previous", "gradient")
+        estimate = "extended", "star_fluxes", "square_sums", "objectives", "steps"
+        return estimate if self.scaling is None else (*estimate, *CHANGES)
 
     def restore(self, state: State) -> None:
         """Continue from this state."""
-        self._star_fluxes = None
         for name in self._stateful:
             self._memory.upload_raw(name, state[name])
-        self._transform_estimate()
-        n_objectives = len(state["objectives"])
-        if not self.is_proven:
-            self._n_restored = n_objectives
-        self._n_objectives = n_objectives
-
-    def _transform_estimate(self) -> None:
-        """Make the row spectrum of an estimate that came from the host, and convolve it."""
-        self._bind("rfft_rows", pixels=self._memory.buffers["extended"])()
-        self._convolve()
-        self._pending_objective = None
+        steps = Steps(*state["steps"].tolist())
+        self._judge_estimate(Steps(recorded=steps.recorded - 1))
+        self._set(steps)

@@ -160,6 +160,8 @@ class Launcher:
         """Return the number of work-groups that a kernel has work for."""
         if name == "collect_sums":
             return 1 + int(arguments["n_stars"]) // STARS_A_GROUP
+        if name == "follow_stars":
+            return 1
         if name == "sample_lines":
             return int(arguments["parts"]) * int(arguments["lines"]) // RUN
         if name == "ratio_sheared":

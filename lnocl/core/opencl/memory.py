@@ -22,34 +22,6 @@ MAX_COPIED = 16 * 2**20
 MIN_COPIED = 2**20
 
 
-class Transfer:
-    """Numbers on their way from the device, which works on meanwhile.
-
-    Parameters
-    ----------
-    queue : pyopencl.CommandQueue
-        In whose order they are read.
-    dtype : numpy.dtype
-        Of the numbers.
-    *ranges : tuple of (pyopencl.Buffer, int, int)
-        Places of the numbers: the buffer, the first byte, and the number of bytes.
-    """
-
-    def __init__(
-        self, queue: cl.CommandQueue, dtype: np.dtype, *ranges: tuple[cl.Buffer, int, int]
-    ) -> None:
-        self._arrays = [np.empty(size // dtype.itemsize, dtype) for _, _, size in ranges]
-        self._events = [
-            cl.enqueue_copy(queue, array, buffer, src_offset=offset, is_blocking=False)
-            for array, (buffer, offset, _) in zip(self._arrays, ranges, strict=True)
-        ]
-
-    def wait(self) -> list[Array]:
-        """Return the arrays, as float64, when they have arrived."""
-        cl.wait_for_events(self._events)
-        return [array.astype(np.float64) for array in self._arrays]
-
-
 class Memory:
     """The buffers of a scene on a device, by name.
 
@@ -80,19 +52,14 @@ class Memory:
             self.buffers[name] = cl.Buffer(self._queue.context, READ_WRITE, size)
 
     def copy(self, one: str, other: str) -> None:
-        """Copy a buffer to another of the same size."""
-        size = int(self.buffers[one].size)
+        """Copy a buffer, or its first numbers, to another, all of which is written."""
+        size = int(self.buffers[other].size)
         cl.enqueue_copy(self._queue, self.buffers[other], self.buffers[one], byte_count=size)
 
     def clear(self, name: str) -> None:
         """Set all of a buffer to 0."""
         buffer = self.buffers[name]
         cl.enqueue_fill_buffer(self._queue, buffer, np.zeros(1, self._layout.dtype), 0, buffer.size)
-
-    def exchange(self, one: str, other: str) -> None:
-        """Exchange the names of two buffers."""
-        buffers = self.buffers
-        buffers[one], buffers[other] = buffers[other], buffers[one]
 
     def upload(self, name: str, values: NDArray) -> Array:
         """Copy numbers to a buffer, not waiting for the device; return them in its precision."""
@@ -160,19 +127,6 @@ class Memory:
         """Copy what `download_raw` returned, or the first of it, back."""
         if values.size:
             cl.enqueue_copy(self._queue, self.buffers[name], values)
-
-    def fetch(self, *names: str) -> Transfer:
-        """Send for all that some buffers hold."""
-        return self.fetch_ranges(*((name, 0, self.count(name)) for name in names))
-
-    def fetch_ranges(self, *ranges: tuple[str, int, int]) -> Transfer:
-        """Send for ranges of buffers: name, first number, and how many numbers."""
-        item = self._layout.dtype.itemsize
-        return Transfer(
-            self._queue,
-            self._layout.dtype,
-            *((self.buffers[name], first * item, count * item) for name, first, count in ranges),
-        )
 
     def count(self, name: str) -> int:
         """Return how many numbers a buffer holds."""

@@ -17,6 +17,7 @@ SOURCES = (
     "convolve.cl",
     "sums.cl",
     "stars.cl",
+    "decide.cl",
     "ratio.cl",
     "turn.cl",
     "smooth.cl",

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from lnocl.core.opencl.launch import Launch
-from lnocl.core.opencl.memory import Memory
 
 
 class TransmittedSky:
@@ -15,14 +14,12 @@ class TransmittedSky:
     ----------
     bind : callable
         Binds a kernel by its name, and arguments that are not shared.
-    memory : Memory
-        With the buffers.
     n_images : int
         Images.
     """
 
-    def __init__(self, bind: Callable[..., Launch], memory: Memory, n_images: int) -> None:
-        self._memory, self._n_images = memory, n_images
+    def __init__(self, bind: Callable[..., Launch], n_images: int) -> None:
+        self._n_images = n_images
         self._transmit, self._gather = bind("transmit_rows"), bind("gather_rows")
         self._convolve, self._correlate = (
             bind(f"{name}_columns", n_images=1) for name in ("convolve", "correlate")
@@ -30,7 +27,6 @@ class TransmittedSky:
 
     def convolve(self) -> None:
         """Make the row spectra of the ``A_j t_j f`` from the estimate."""
-        self._transmit.set(extended=self._memory.buffers["extended"])
         self._transmit()
         self._each(self._convolve)
 

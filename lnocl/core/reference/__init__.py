@@ -7,12 +7,12 @@ A twin takes and returns arrays in their natural order, where the kernel has its
 
 from lnocl.core.reference.columns import fft_columns, ifft_columns
 from lnocl.core.reference.convolve import convolve_columns, correlate_columns, otf_columns
+from lnocl.core.reference.decide import collect_sums, follow_stars
 from lnocl.core.reference.ratio import ratio_rows
 from lnocl.core.reference.rows import irfft_rows, rfft_rows
 from lnocl.core.reference.scale import scale_rows
 from lnocl.core.reference.smooth import smooth
-from lnocl.core.reference.step import gradient_rows, step_rows
-from lnocl.core.reference.sums import collect_sums
+from lnocl.core.reference.step import gradient_rows, shortened, step_rows
 from lnocl.core.reference.transmit import gather_rows, transmit_rows
 from lnocl.core.reference.turn import (
     irfft_sheared,
@@ -27,6 +27,7 @@ __all__ = [
     "convolve_columns",
     "correlate_columns",
     "fft_columns",
+    "follow_stars",
     "gather_rows",
     "gradient_rows",
     "ifft_columns",
@@ -39,6 +40,7 @@ __all__ = [
     "rfft_sheared",
     "sample_lines",
     "scale_rows",
+    "shortened",
     "smooth",
     "step_rows",
     "transmit_rows",

@@ -15,6 +15,9 @@ def scale_rows(
     mu: float,
     star_fluxes: Array,
     star_corrections: Array,
+    star_weights: Array,
+    prior_fluxes: Array,
+    prior_precision: Array,
     slope: Array | float = 0.0,
     curvature: Array | float = 0.0,
 ) -> tuple[Array, ComplexArray, float, Array]:
@@ -22,7 +25,8 @@ def scale_rows(
 
     ``f <- f (1 + a u) / (1 + (mu + curvature) f a)``, ``u = c + curvature f - slope``, with
     ``c = sum_j A_j^T (r_j - w_j)`` and ``a = 1 / sum_j A_j^T w_j``, 0 where nothing was observed;
-    ``c_s`` is multiplied by its correction; La Camera et al. (2012), Eq. 9, as
+    ``c_s`` becomes ``c_s (p_s u_s + q_s c0_s) / (p_s + q_s c_s)``, with its correction u_s, its
+    weight p_s, and its prior's flux and precision c0_s and q_s; La Camera et al. (2012), Eq. 9, as
     ``sum_j A_j^T w_j`` is what ``r_j = w_j`` gives. slope and curvature, of the edge-preserving
     term (`smooth`), split its gradient into curvature f and what is left, neither negative.
     A correction ``1 + a u`` that rounding has made negative counts as 0.
@@ -31,4 +35,6 @@ def scale_rows(
     correction = np.maximum(1.0 + inverse_weight * excess, 0.0)
     scaled = extended * correction / (1.0 + (mu + curvature) * extended * inverse_weight)
     squares = float((scaled**2).sum())
-    return scaled, rfft_rows(scaled), squares, star_fluxes * star_corrections
+    known = prior_precision / star_weights
+    fluxes = star_fluxes * (star_corrections + known * prior_fluxes) / (1.0 + known * star_fluxes)
+    return scaled, rfft_rows(scaled), squares, fluxes

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from lnocl.core.reference.decide import SHORTER
 from lnocl.core.reference.rows import ComplexArray, irfft_rows, rfft_rows
 from lnocl.core.scene.arrays import Array
 
@@ -46,18 +47,26 @@ def step_rows(
     cross_information: Array,
     mu: float,
     alpha: float,
-    share: float,
     curvature: Array | float = 0.0,
 ) -> tuple[Array, ComplexArray, float, float, Array]:
-    """Return ``f + share d``, its row spectrum and squares, ``<gradient, d>`` and ``<c_s, d>``.
+    """Return ``f + d``, its row spectrum and squares, ``<gradient, d>`` and ``<c_s, d>``.
 
     ``d = P(f - alpha D gradient) - f`` with P the projection on ``f >= 0``, D as in
     `gradient_rows`, and c_s the cross information of star s; Bonettini, Zanella & Zanni (2009),
     Inverse Problems 25, 015002.
     """
     scaling = _shifted_scaling(extended, shift, inverse_weight, mu + curvature)
-    direction = np.maximum(extended - alpha * scaling * gradient, 0.0) - extended
-    trial = np.maximum(extended + share * direction, 0.0)
+    trial = np.maximum(extended - alpha * scaling * gradient, 0.0)
+    direction = trial - extended
     slope = float((gradient * direction).sum())
     coupling = (cross_information * direction).sum(axis=(-2, -1))
     return trial, rfft_rows(trial), float((trial**2).sum()), slope, coupling
+
+
+def shortened(extended: Array, previous: Array) -> tuple[Array, ComplexArray, float]:
+    """Return an estimate nearer to the one before it, its row spectrum and squares.
+
+    It is what `step_rows` makes where its last step was refused.
+    """
+    trial = previous + SHORTER * (extended - previous)
+    return trial, rfft_rows(trial), float((trial**2).sum())

@@ -90,7 +90,7 @@ class GuardedRuns:
     setup : Setup
         The images and the parameters of the runs; one star or more among them.
     tick : callable, optional
-        Is called after each iteration.
+        Is told how many iterations are done more.
 
     Attributes
     ----------
@@ -108,7 +108,7 @@ class GuardedRuns:
         Of runs that are not smoothed more strongly near stars.
     """
 
-    def __init__(self, setup: Setup, tick: Callable[[], object] = int) -> None:
+    def __init__(self, setup: Setup, tick: Callable[[int], object] = int) -> None:
         self.whole, self._tick, observation = setup, tick, setup.observation
         # PSFs that are cut to the window go without what has the shape of whole ones.
         shown = with_noise_shown(observation).replace(**dict.fromkeys(BESIDE_PSFS))
@@ -232,8 +232,7 @@ class GuardedRuns:
         # Stars are moved at the start of a round alone.
         run = Run(replace(start, setup=replace(start.setup, refine_positions=False)), n_iter)
         with suppress(DivergedError):  # by negative PSFs: the misfit tells how good the end is
-            for _ in run:
-                self._tick()
+            run.complete(self._tick)
         estimate, model = run.estimate(), make_model(run.scene)
         misfit = measure_misfit(estimate, model, estimate)
         if misfit.is_significant:  # which may be of structure that was smoothed
@@ -274,7 +273,9 @@ class GuardedRuns:
         return mapped(psfs, complete)
 
 
-def steady_estimate(setup: Setup, penalty: Penalty, tick: Callable[[], object] = int) -> Estimate:
+def steady_estimate(
+    setup: Setup, penalty: Penalty, tick: Callable[[int], object] = int
+) -> Estimate:
     """Return the estimate of a run with stars where they are given, and halos held.
 
     Raises

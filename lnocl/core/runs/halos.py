@@ -56,6 +56,5 @@ def _short_run(setup: Setup) -> Estimate:
     """Return the estimate after a short run."""
     free = replace(setup, solver="sgp", refine_positions=False, initial_extended=None)
     run = Run(make_start(free, Penalty()), N_ITER)
-    for _ in run:
-        pass
+    run.complete()
     return run.estimate()

@@ -9,10 +9,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from lnocl.core.engines.engine import State
 from lnocl.core.runs.run import Run
 from lnocl.core.runs.start import Start
 from lnocl.core.scene.arrays import Array
-from lnocl.core.solvers.engine import State
 from lnocl.errors import DivergedError, NotFiniteError, warn
 
 # The ratio of one iteration of which a snapshot is taken to that before.
@@ -52,6 +52,8 @@ class Halves:
         Where they start.
     n_iter : int
         The last iteration, at most.
+    stride : int
+        Iterations between two looks at them, at most.
     first : int
         The iteration that they start from.
 
@@ -65,9 +67,10 @@ class Halves:
         At iterations a tenth apart.
     """
 
-    def __init__(self, starts: Sequence[Start], n_iter: int, first: int = 0) -> None:
-        self._start, self._n_iter = starts[0], n_iter
+    def __init__(self, starts: Sequence[Start], n_iter: int, stride: int, first: int = 0) -> None:
+        self._start, self._n_iter, self._stride = starts[0], n_iter, stride
         self._runs = [Run(start, n_iter - first, half) for half, start in enumerate(starts)]
+        self._going = [iter(run) for run in self._runs]
         self.first = self.done = first
         self.snapshots: list[Snapshot] = []
 
@@ -86,8 +89,7 @@ class Halves:
         """
         due = self._due()
         try:
-            for done, _ in zip(*self._runs, strict=False):
-                self.done = self.first + done
+            while self._advance(min(due, self.done + self._stride, self._n_iter)):
                 if self.done == due:
                     self.snapshots.append(self.snapshot())
                     due = self._due()
@@ -101,6 +103,16 @@ class Halves:
                 f"the objective of a half of the counts rises after iteration {best}: held-out "
                 f"counts choose among the iterations up to {self.snapshots[-1].iteration}"
             )
+
+    def _advance(self, goal: int) -> bool:
+        """Run both to an iteration beyond those done; return whether they get there."""
+        for run, going in zip(self._runs, self._going, strict=True):
+            run.goal = goal - self.first
+            while run.done < run.goal:
+                if next(going, None) is None:
+                    return False
+        is_there, self.done = goal > self.done, goal
+        return is_there
 
     def _due(self) -> int:
         """Return the iteration of the next snapshot."""
@@ -142,8 +154,6 @@ class Halves:
 
     def objectives(self, last: int) -> Array:
         """Return the sums of the objectives, of where they started and all iterations up to one."""
-        for run in self._runs:
-            run.finish()
         first, second = (run.objectives()[: last - self.first + 1] for run in self._runs)
         return first + second
 

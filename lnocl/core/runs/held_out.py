@@ -16,6 +16,7 @@ from typing import NamedTuple, cast
 import numpy as np
 from numpy.typing import NDArray
 
+from lnocl.core.engines.engine import State
 from lnocl.core.runs.assessment import assess
 from lnocl.core.runs.halves import Halves, Snapshot, pack, unpack
 from lnocl.core.runs.outcome import CURVE_DTYPE, Outcome
@@ -24,7 +25,6 @@ from lnocl.core.runs.thinning import split_counts
 from lnocl.core.scene.arrays import Array
 from lnocl.core.scene.estimate import Estimate
 from lnocl.core.scene.penalty import Penalty
-from lnocl.core.solvers.engine import State
 from lnocl.errors import InputError, note, warn
 from lnocl.process import ignored_notes
 
@@ -58,6 +58,8 @@ class HeldOutCounts:
         To choose from: each is tried unless the one before was worse than the one before that.
     n_iter : int
         Iterations at most.
+    stride : int
+        Iterations between two looks at halves, at most.
 
     Raises
     ------
@@ -65,8 +67,11 @@ class HeldOutCounts:
         The images hold no counts, or too many in a pixel.
     """
 
-    def __init__(self, start: Start, penalties: Sequence[Penalty], n_iter: int) -> None:
+    def __init__(
+        self, start: Start, penalties: Sequence[Penalty], n_iter: int, stride: int
+    ) -> None:
         self._start, self._penalties, self._n_iter = start, penalties, n_iter
+        self._stride = stride
         self._counts = split_counts(start.scene.observation)
         self._curves: list[NDArray[np.void]] = []
         self._first: _First | None = None
@@ -79,7 +84,7 @@ class HeldOutCounts:
         start = self._start.penalised(self._penalties[len(self._curves)])
         starts = [start.of_half(each) for each in self._counts]
         if self._first is None:
-            return Halves(starts, self._n_iter)
+            return Halves(starts, self._n_iter, self._stride)
         iteration, *estimates = self._first.origin
         starts = [
             half.at(extended.astype(np.float64), star_fluxes, positions)
@@ -87,7 +92,7 @@ class HeldOutCounts:
         ]
         last = min(self._n_iter, math.ceil(LATER_LENGTH * self._first.n_iter))
         with ignored_notes():  # of memory, which the first halves have announced
-            halves = Halves(starts, last, iteration)
+            halves = Halves(starts, last, self._stride, iteration)
         halves.snapshots.append(self._first.origin)
         return halves
 
@@ -97,7 +102,7 @@ class HeldOutCounts:
         Parameters
         ----------
         look : callable
-            Is called after each iteration of the halves.
+            Is called after each look at the halves.
         save : callable
             Is called where `state` may be saved.
 

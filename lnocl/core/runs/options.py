@@ -29,8 +29,8 @@ PRECISIONS: tuple[Precision, ...] = get_args(Precision)
 ENGINES: tuple[EngineName, ...] = get_args(EngineName)
 STOPS: tuple[StopName, ...] = get_args(StopName)
 
-# Kernels count iterations in 32 bits.
-MAX_ITERATIONS = 2**31 - 2
+# Kernels count iterations in single precision, whose whole numbers have 24 bits.
+MAX_ITERATIONS = 2**24 - 2
 
 # The difference between single and double precision, as a share of the extended source, for each
 # iteration of a long run, and the share that is worth a warning (benchmarks/precision.py,
@@ -63,7 +63,7 @@ def check_choices(solver: str, precision: str, engine: str, device: object) -> N
         A name is unknown; a device is not text, or given for the reference.
     """
     choices = {
-        "solver": (solver, tuple(SOLVERS)),
+        "solver": (solver, SOLVERS),
         "precision": (precision, PRECISIONS),
         "engine": (engine, ENGINES),
     }

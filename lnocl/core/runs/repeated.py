@@ -48,7 +48,6 @@ class Repeated:
             run.scene.star_prior = prior.scaled(run.scene.unit, run.scene.scale)
         run.repeat(self._start, outcome.scene.observation.replace(images=counts))
         with np.errstate(over="ignore", invalid="ignore"):
-            for _ in run:
-                pass
+            run.complete()
         wanted = outcome.is_marginal, outcome.has_marginal_halos, outcome.has_levels
         return dataclasses.replace(outcome, estimate=marginalise(run.estimate(), *wanted))

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import math
+from collections.abc import Callable, Iterator
 from copy import copy
 from functools import cached_property
-from itertools import islice
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
+from lnocl.core.engines.engine import Engine, State
 from lnocl.core.runs.descent import Descent
 from lnocl.core.runs.outcome import Outcome
 from lnocl.core.runs.start import Setup, Start, make_model, measure_steps, move_stars
@@ -18,9 +19,7 @@ from lnocl.core.scene.arrays import Array
 from lnocl.core.scene.estimate import Estimate
 from lnocl.core.scene.observation import Observation
 from lnocl.core.scene.scene import Scene
-from lnocl.core.solvers import SOLVERS
-from lnocl.core.solvers.engine import Engine, State
-from lnocl.core.solvers.sgp import Steps
+from lnocl.core.scene.steps import NOT_FINITE, PAUSED, SETTLED
 from lnocl.errors import refuse_not_finite
 
 if TYPE_CHECKING:
@@ -29,6 +28,9 @@ if TYPE_CHECKING:
 
 # Star positions are refined after this many iterations, then after twice as many each time.
 FIRST_REFINED = 3
+# Iterations that are queued at once: as many as have so many pixels, so that an interrupt is
+# answered soon, and no more than this, as the device runs idle while the host looks.
+AHEAD_PIXELS, MOST_AHEAD = 2**26, 64
 
 
 class Run:
@@ -42,6 +44,9 @@ class Run:
         Iterations at most.
     half : {0, 1}, optional
         Which half of the counts it is of, where both are run side by side.
+    tolerance : float, optional
+        It ends where the objective changes by less than this share of itself an iteration, in the
+        mean of ten; 0 for never.
 
     Attributes
     ----------
@@ -53,6 +58,12 @@ class Run:
         Iterations at most.
     done : int
         Iterations done.
+    tolerance : float
+        As given; it may be changed.
+    stride : int
+        Iterations between two looks at the run, at most; it may be changed.
+    goal : int
+        An iteration that it is looked at; it may be changed.
 
     Raises
     ------
@@ -60,9 +71,13 @@ class Run:
         As `deconvolve`.
     """
 
-    def __init__(self, start: Start, n_iter: int, half: int | None = None) -> None:
+    def __init__(
+        self, start: Start, n_iter: int, half: int | None = None, tolerance: float = 0.0
+    ) -> None:
         self._setup, self.n_iter, self._half = start.setup, n_iter, half
-        self.scene = copy(start.scene)
+        self.scene, self.tolerance = copy(start.scene), tolerance
+        pixels = self.scene.n_images * math.prod(self.scene.grid)
+        self.stride, self.goal = min(max(AHEAD_PIXELS // pixels, 1), MOST_AHEAD), n_iter
         self._refines = start.refines
         self.engine = _make_engine(self._setup, self.scene, n_iter, start.scaling, half)
         self._begin(start)
@@ -92,27 +107,67 @@ class Run:
         self._begin(start)
 
     def __iter__(self) -> Iterator[int]:
-        solve = SOLVERS[self._setup.solver]
+        """Run to the end, yielding the iterations done at each look.
+
+        Raises
+        ------
+        NotFiniteError, DivergedError
+            The objective is not finite, or rises.
+        """
         descent = Descent(self.scene)
-        descent.check(self.engine.objectives().tolist())  # those from before a checkpoint
+        self._check(descent, 0)  # those from before a checkpoint
         while self.done < self.n_iter:
-            begin, is_stage_new = self.done, not self._steps.has_iterated
-            prior = self.scene.star_prior
-            for iteration in solve(self.engine, self._due - begin, self._steps, prior):
-                self.done = begin + iteration
-                if fetched := self.engine.fetched_objectives():
-                    descent.check(fetched)
+            begin, is_stage_new = self.done, self.engine.look().is_first
+            while (looked := self.done) < (due := min(self._due, self.n_iter)):
+                if not self._advance(due):
+                    break
+                self._check(descent, looked + 1)
                 yield self.done
-            was_stuck = is_stage_new and begin == self.done < self._due
-            if was_stuck or not self._refines:
+            was_stuck = is_stage_new and begin == self.done < due
+            if was_stuck or self.is_settled or not self._refines:
                 return
             if self.done < self.n_iter:
                 self._refine()
                 self._begin_stage()
 
+    def _check(self, descent: Descent, first: int) -> None:
+        """Refuse objectives that rise, where steps are not refused for that."""
+        if self.engine.scaling is None:
+            descent.check(self.engine.objectives(first).tolist())
+
+    def _advance(self, due: int) -> bool:
+        """Do iterations until the next look is due; return whether any was done."""
+        before, engine = self.done, self.engine
+        if engine.look().reason == PAUSED:
+            goal = min(before + self.stride, due, self.goal)
+            engine.go_on(goal + 1, self.tolerance)
+            for _ in range(goal - before):
+                engine.tick()
+            while engine.look().going:  # as steps were refused
+                engine.tick()
+        steps = engine.look()
+        if steps.reason == NOT_FINITE:
+            refuse_not_finite(math.nan)
+        self.done = steps.done
+        return self.done > before
+
+    def complete(self, tick: Callable[[int], object] = int) -> str:
+        """Run to the end, telling how many iterations are done more; return why it ended."""
+        before = self.done
+        for done in self:
+            tick(done - before)
+            before = done
+        if self.is_settled:
+            return "change"
+        return "n_iter" if self.done == self.n_iter else "converged"
+
+    @property
+    def is_settled(self) -> bool:
+        """Whether the objective changes by less than the tolerance."""
+        return self.engine.look().reason == SETTLED
+
     def _begin_stage(self) -> None:
         """Set the iteration until which positions stay: the next to refine at, or the last."""
-        self._steps = Steps()
         due = max(FIRST_REFINED, 2 * self.done) if self._refines else self.n_iter
         self._due = min(due, self.n_iter)
 
@@ -124,11 +179,10 @@ class Run:
         NotFiniteError
             A value is infinite or not a number.
         """
-        steps, scaling = self._steps, self.engine.scaling
+        scaling = self.engine.scaling
         state: State = {
             **self.engine.state(),
-            "progress": np.array([self.done, self._due, steps.has_iterated]),
-            "steps": np.array([steps.alpha, *steps.lengths]),
+            "progress": np.array([self.done, self._due]),
             "positions": self.scene.stars,
         }
         if scaling is not None:
@@ -145,20 +199,13 @@ class Run:
         NotFiniteError
             The objective is infinite or not a number, or values in the state are.
         """
-        state = self.state()
-        is_recorded = len(self.engine.objectives()) > self.done
-        self.finish()
-        objectives = self.engine.objectives()
+        state, objectives = self.state(), self.engine.objectives()
         refuse_not_finite(objectives[-1])
-        if not is_recorded:  # the solver is about to make the same ratios
-            self.engine.restore(state)
         return state, int(np.argmin(objectives)) == self.done
 
     def restore(self, state: State) -> None:
         """Continue from the state of a run of the same observation and parameters."""
-        self.done, self._due = (int(number) for number in state["progress"][:2])
-        alpha, *lengths = state["steps"].tolist()
-        self._steps = Steps(alpha, lengths, bool(state["progress"][2]))
+        self.done, self._due = state["progress"].tolist()
         if self._refines:
             self.scene.move_stars(state["positions"])
             self.engine.move_stars()
@@ -167,7 +214,6 @@ class Run:
 
             self.engine.set_scaling(Scaling.from_state(state))
         self.engine.restore(state)
-        self._forget_end()
 
     def return_to_best(self, state: State) -> None:
         """Iterate from a state to the estimate of the least objective before the first not finite.
@@ -184,9 +230,9 @@ class Run:
         del self.engine  # the device need not hold both
         self.engine = _make_engine(self._setup, self.scene, self.n_iter, scaling, self._half)
         self.restore(state)
-        for _ in islice(self, max(best - self.done, 0)):
-            pass
-        self.finish()
+        n_iter, self.n_iter = self.n_iter, best
+        self.complete()
+        self.n_iter = n_iter
         self.state()  # refuses values that are not finite
 
     @cached_property
@@ -196,7 +242,6 @@ class Run:
 
     def _refine(self) -> None:
         """Move the stars to where they are most likely, given the current extended source."""
-        self._forget_end()
         extended = self.engine.extended()
         refuse_not_finite(extended.sum())
         shared = self._setup, self.scene, self._model, extended
@@ -205,7 +250,7 @@ class Run:
         if scaling is not None:
             self.engine.set_scaling(scaling)
         self.engine.move_stars()
-        self.engine.start(extended, star_fluxes)
+        self.engine.start(extended, star_fluxes, self.done)
 
     def estimate(self) -> Estimate:
         """Return the estimate on the grid."""
@@ -254,25 +299,14 @@ class Run:
         """
         Descent(self.scene).check(self.engine.objectives().tolist())
 
-    def finish(self) -> None:
-        """Record the objective of the current estimate, where the solver has not done so."""
-        if len(self.engine.objectives()) == self.done:
-            self.engine.ratio()
-
     def outcome(self, stop_reason: str) -> Outcome:
         """Return the estimate and the record of a run that has ended."""
-        self.finish()
         return Outcome(
             setup=self._setup,
             estimate=self.estimate(),
             objectives=self.objectives(),
             stop_reason=stop_reason,
         )
-
-    def _forget_end(self) -> None:
-        """Take the objective of the current estimate off the record, where it is there."""
-        if len(self.engine.objectives()) > self.done:
-            self.engine.forget_objective()
 
 
 def _make_engine(

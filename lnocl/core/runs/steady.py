@@ -20,7 +20,6 @@ import numpy as np
 from lnocl.core.runs.outcome import Outcome
 from lnocl.core.runs.run import Run
 from lnocl.core.runs.start import Start
-from lnocl.core.runs.stopping import Change
 from lnocl.core.scene.penalty import Penalty
 from lnocl.core.scene.star_prior import StarPrior
 from lnocl.process import ignored_notes, ignored_warnings
@@ -45,7 +44,7 @@ def steady_penalty(penalties: Sequence[Penalty]) -> Penalty | None:
 
 
 def run_steadily(
-    start: Start, penalty: Penalty, n_iter: int, tick: Callable[[], object] = int
+    start: Start, penalty: Penalty, n_iter: int, tick: Callable[[int], object] = int
 ) -> Outcome:
     """Return the outcome of a run to where it settles.
 
@@ -58,16 +57,11 @@ def run_steadily(
     n_iter : int
         Iterations at most.
     tick : callable, optional
-        Is called after each iteration.
+        Is told how many iterations are done more.
     """
-    rule = Change(SETTLED)
     with ignored_notes(), ignored_warnings():  # the runs that follow say the same
-        run = Run(start.penalised(penalty), n_iter)
-        for _ in run:
-            tick()
-            if rule.met(run):
-                return run.outcome(rule.reason)
-        return run.outcome("n_iter" if run.done == n_iter else "converged")
+        run = Run(start.penalised(penalty), n_iter, tolerance=SETTLED)
+        return run.outcome(run.complete(tick))
 
 
 def told_prior(outcome: Outcome) -> StarPrior:

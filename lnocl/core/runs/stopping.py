@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import deque
 from functools import cache
 from typing import TYPE_CHECKING, Any
 
@@ -11,22 +10,30 @@ from numpy.typing import ArrayLike
 
 from lnocl.core.runs.run import Run
 from lnocl.core.scene.arrays import Array
+from lnocl.core.scene.steps import CHANGE_WINDOW
 from lnocl.errors import warn
 
 if TYPE_CHECKING:
     from lnocl.core.scene.forward_model import Model
 
-# A step of the scaled gradient projection method may be short by chance, ten are not.
-CHANGE_WINDOW = 10
-
 
 class Rule:
-    """A rule that ends a run; this one leaves it to go on to its last iteration."""
+    """A rule that ends a run; this one leaves it to go on to its last iteration.
 
-    reason = "n_iter"
+    Attributes
+    ----------
+    reason : str
+        The reason that it gives.
+    tolerance : float
+        That of the run.
+    looks : bool
+        Whether it looks at each iteration.
+    """
+
+    reason, tolerance, looks = "n_iter", 0.0, False
 
     def met(self, run: Run) -> bool:
-        """Return whether the run should end; asked once after each iteration."""
+        """Return whether the run should end; asked once after each look at it."""
         return False
 
     def miss(self, run: Run) -> None:
@@ -50,31 +57,17 @@ class Change(Rule):
     reason = "change"
 
     def __init__(self, threshold: float) -> None:
-        self._threshold = threshold
-        self._recent: deque[float] = deque(maxlen=CHANGE_WINDOW + 1)
+        self.tolerance = threshold
 
     def met(self, run: Run) -> bool:
         """Return whether the objective has settled."""
-        self._recent.append(run.objective())
-        return len(self._recent) > CHANGE_WINDOW and self._change() < self._threshold
+        return run.is_settled
 
     def quantity(self, run: Run) -> str:
         """Return the relative change an iteration."""
-        return f"change {self._change():.2g}"
-
-    def state(self) -> Array:
-        """Return the last objectives."""
-        return np.array(self._recent, np.float64)
-
-    def restore(self, state: Array) -> None:
-        """Continue with these last objectives."""
-        self._recent.extend(state.tolist())
-
-    def _change(self) -> float:
-        first, last = self._recent[0], self._recent[-1]
-        if last == 0 or len(self._recent) < 2:
-            return 0.0
-        return abs(first - last) / (len(self._recent) - 1) / abs(last)
+        recent = run.engine.objectives()[-1 - CHANGE_WINDOW :]
+        change = abs(recent[0] - recent[-1]) / max(len(recent) - 1, 1)
+        return f"change {change / (abs(recent[-1]) or 1.0):.2g}"
 
 
 class Discrepancy(Rule):
@@ -86,7 +79,7 @@ class Discrepancy(Rule):
     expectation is updated at iterations 1, 2, 4, 8 ..., and before the run ends.
     """
 
-    reason = "discrepancy"
+    reason, looks = "discrepancy", True
 
     def __init__(self) -> None:
         self._model: Model | None = None

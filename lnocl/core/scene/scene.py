@@ -249,6 +249,11 @@ class Scene:
         """Whether the extended source has an edge-preserving term."""
         return self.smoothing > 0 or self.smoothing_map is not None
 
+    def prior_of_fluxes(self) -> tuple[Array, Array]:
+        """Return flux and precision of the prior of each flux; a precision of 0 where none is."""
+        prior, nothing = self.star_prior, np.zeros(self.n_fluxes)
+        return (nothing, nothing) if prior is None else (prior.fluxes, prior.precision)
+
     def penalised(self, penalty: Penalty) -> Scene:
         """Return this scene with another penalty."""
         other = copy(self)

@@ -50,26 +50,6 @@ class StarPrior:
         drawn = fluxes + errors * rng.standard_normal(len(fluxes))
         return replace(self, fluxes=np.where(is_known, drawn, 0.0))
 
-    def value(self, fluxes: Array) -> float:
-        """Return the term."""
-        return 0.5 * float(self.precision @ (fluxes - self.fluxes) ** 2)
-
-    def after(self, before: Array, scaled: Array, weights: Array) -> Array:
-        """Return the fluxes after an iteration of the split-gradient method, the prior in it.
-
-        With ``c_s' = c_s U / p`` without it, they are
-        ``c_s (U + c0_s / sigma_s^2) / (p + c_s / sigma_s^2)``.
-
-        Parameters
-        ----------
-        before, scaled : ndarray of float64, shape (n_fluxes,)
-            The c_s and the c_s'.
-        weights : ndarray of float64, shape (n_fluxes,)
-            The p, ``sum_j <P_js, w_j>``.
-        """
-        pulled = weights * scaled + self.precision * self.fluxes * before
-        return np.asarray(pulled / (weights + self.precision * before))
-
     def gradient(self, fluxes: Array) -> Array:
         """Return its gradient in the fluxes."""
         return self.precision * (fluxes - self.fluxes)

@@ -1,14 +1,8 @@
-"""The iterations, and the fit of star fluxes and positions."""
+"""What an iteration needs beside its kernels: the scaling of steps, and fits of stars and PSFs."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from typing import Literal
+from typing import Literal, get_args
 
-from lnocl.core.scene.star_prior import StarPrior
-from lnocl.core.solvers import sgm, sgp
-from lnocl.core.solvers.engine import Engine
-
-Solver = Callable[[Engine, int, sgp.Steps, StarPrior | None], Iterator[int]]
-SolverName = Literal["sgp", "sgm"]
-SOLVERS: dict[SolverName, Solver] = {"sgm": sgm.sgm, "sgp": sgp.sgp}
+SolverName = Literal["sgm", "sgp"]
+SOLVERS: tuple[SolverName, ...] = get_args(SolverName)

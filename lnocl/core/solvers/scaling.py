@@ -83,15 +83,6 @@ class Scaling:
             for end, (y, x, height, width) in zip(ends, windows, strict=True)
         ]
 
-    def star_step(self, fluxes: Array, gradient: Array, coupling: Array) -> Array:
-        """Return the change of the star fluxes that follows a step d of the extended source.
-
-        ``-F^-1 (gradient + <cross_information, d>)``: to the fluxes that are best where the step
-        leads, to second order, with the information F of the start; none falls by more than nine
-        tenths.
-        """
-        return bounded_step(self.star_information, gradient + coupling, fluxes)
-
     def holding(self, n: int) -> Scaling:
         """Return this scaling with so many fluxes more, which stay as they are."""
         before = self.star_information
@@ -162,10 +153,8 @@ def heed(prior: StarPrior | None, star_fluxes: Array, scaling: Scaling) -> tuple
     if prior is None:
         return star_fluxes, scaling
     scaling = scaling.with_prior(prior)
-    nothing = np.zeros_like(star_fluxes)
-    return star_fluxes + scaling.star_step(
-        star_fluxes, prior.gradient(star_fluxes), nothing
-    ), scaling
+    change = bounded_step(scaling.star_information, prior.gradient(star_fluxes), star_fluxes)
+    return star_fluxes + change, scaling
 
 
 def _back_projections(model: Model) -> tuple[Array, Array]:
