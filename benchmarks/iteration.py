@@ -138,14 +138,18 @@ def without_objective(scene, device):
         program.source = source
 
 
-def compare_steps(device, turns, n_images, size=1024):
-    """Return the table of the two solvers' iterations on a real scene with one star."""
+def compare_steps(device, turns, n_images, size):
+    """Return the table of the two solvers' iterations on a real scene with one star.
+
+    Those of a smoothed scene are compared with each other too.
+    """
     made = simulate(hh34(size), Experiment(angles=np.arange(n_images) * 180.0 / n_images * u.deg))
     scene = Scene(observe(made), made.stars)
     smoothed = Scene(observe(made), made.stars, Penalty(smoothing=1e-4))
     named = {
         "sgm": sides.Lnocl(scene, np.float32, device),
         "sgp": sides.Steps(scene, np.float32, device),
+        "sgm, smoothed": sides.Lnocl(smoothed, np.float32, device),
         "sgp, smoothed": sides.Steps(smoothed, np.float32, device),
     }
     return rows("step", size, n_images, np.float32, list(named), take_turns(named, turns))
@@ -156,7 +160,9 @@ SWEEPS = {
     "images": lambda *given: [compare("images", 1024, p, np.float32, *given) for p in IMAGES],
     "double": lambda *given: [compare("double", n, 4, np.float64, *given) for n in DOUBLE_SIZES],
     "scene": lambda *given: [compare_scenes(*given)],
-    "step": lambda *given: [compare_steps(*given, n_images=p) for p in (1, 2, 4)],
+    "step": lambda *given: [
+        compare_steps(*given, n_images=p, size=n) for n in SIZES[:-1] for p in (1, 4)
+    ],
 }
 
 
