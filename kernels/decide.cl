@@ -102,7 +102,7 @@ INLINE real flux_gradient(
  * to second order, with the information F of the start, and a step that was shortened as far.
  * change = -F^-1 (gradient + <cross_information, d>) within bounds; where that leads uphill,
  * -F^-1 gradient. gradient_s = -star_totals_s + prior_precision_s (c_s0 - prior_fluxes_s).
- * steps: [N_STEPS], updated: step lengths, slope, and change of the prior's term.
+ * steps: the numbers of a run (precision.cl), updated: step lengths, slope, change of the prior.
  * star_fluxes: [n_stars], in: c_s0 or what was tried, out: c_s. star_steps: [4][n_stars], c_s0 and
  * change, kept between shorter and shorter steps, and two for what is on the way.
  * star_totals: [n_stars][2]. coupling_sums: [n_stars][cross_blocks][2]. star_inverse: [n_stars]
@@ -187,7 +187,7 @@ INLINE bool has_settled(__global const real *steps, __global const real *objecti
         || fabs(change) < steps[TOLERANCE] * CHANGE_WINDOW * fabs(last[0] + last[1]);
 }
 
-/* Takes or refuses a step by its objective, and says whether the run goes on. */
+/* Takes or refuses a step by its objective, and tells whether the run continues. */
 INLINE void decide(__global real *steps, __global real *objectives, const real_sum objective)
 {
     const int n = steps[RECORDED];
@@ -230,7 +230,7 @@ INLINE void decide(__global real *steps, __global real *objectives, const real_s
  * star_totals_s = sum_j <P_js, r_j - w_j>; star_corrections_s = 1 + star_totals_s / star_weights_s,
  * not below 0 (negative PSF pixels). The step that led there is taken, and its objective recorded,
  * where that fell by SUFFICIENT of what the slope promises, the prior's change included.
- * steps: [N_STEPS], updated: objectives recorded, shortenings and share, fresh, going, reason.
+ * steps: as above, updated: objectives recorded, shortenings and share, fresh, going, reason.
  * objectives: [iterations + 1][2], a compensated pair each; entry steps[RECORDED] is written.
  * data_term: [2], J_0. star_totals: [n_stars][2]. star_corrections, star_weights: [n_stars].
  * ratio_sums: [IMAGE_ROW_BLOCKS][n_images][2]. star_sums: [n_stars][n_images][star_blocks][2].

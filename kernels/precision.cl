@@ -111,7 +111,7 @@ typedef PASTE(BITS, WIDTH) ivec;
 
 /* The numbers that a run has on the device, of what its solver has decided: `steps`. */
 enum {
-    GOING,        /* whether it goes on */
+    GOING,        /* whether it continues */
     FRESH,        /* whether this tick has a new estimate */
     RECORDED,     /* objectives recorded */
     TARGET,       /* as many end it for now */

@@ -46,7 +46,7 @@ ROUNDING = 3e-7
 
 @guarded
 class OpenCLEngine:
-    """A scene on a device, which decides by itself how an iteration goes on.
+    """A scene on a device, which takes or refuses each step by itself.
 
     Parameters
     ----------

@@ -47,7 +47,8 @@ def bounded_step(star_inverse: Array, force: Array, fluxes: Array) -> Array:
     below its bound is pushed there, and pushes the others.
     """
     least = -MOST_FADING * fluxes
-    change, pushes = -star_inverse @ force, np.zeros(len(fluxes))
+    # Without BLAS, whose rounding depends on the number of threads.
+    change, pushes = -(star_inverse * force).sum(axis=1), np.zeros(len(fluxes))
     for _ in range(N_ROUNDS):
         if not (change < least - NEARLY * fluxes).any():
             break

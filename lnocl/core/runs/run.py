@@ -63,7 +63,7 @@ class Run:
     stride : int
         Iterations between two looks at the run, at most; it may be changed.
     goal : int
-        An iteration that it is looked at; it may be changed.
+        An iteration beyond which it does not run before the next look; it may be changed.
 
     Raises
     ------

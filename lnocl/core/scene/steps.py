@@ -21,7 +21,7 @@ class Steps:
     Attributes
     ----------
     going : float
-        Whether it goes on, 1 or 0.
+        Whether it continues, 1 or 0.
     fresh : float
         Whether the last tick has made a new estimate.
     recorded : float
