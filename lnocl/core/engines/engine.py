@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, Protocol
 
+import numpy as np
 from numpy.typing import NDArray
 
 from lnocl.core.scene.arrays import Array
@@ -74,8 +75,8 @@ class Engine(Protocol):
     def data_term(self) -> float:
         """Return the data term J_0 of the last tick's estimate."""
 
-    def extended(self) -> Array:
-        """Return the extended source."""
+    def extended(self) -> NDArray[np.floating]:
+        """Return the extended source, in the precision of the engine."""
 
     def star_fluxes(self) -> Array:
         """Return the star fluxes."""

@@ -307,7 +307,7 @@ class OpenCLEngine:
                 cl.enqueue_copy(self._queue, spectra, spectra, byte_count=size, dst_offset=j * size)
         self._bind("correlate_columns")()
         self._bind("irfft_rows", pixels=self._memory.buffers["extended"])()
-        return self.extended()
+        return self.extended().astype(np.float64)
 
     def _invert(self, total: Array) -> None:
         """Make 1 / sum_j A_j^T w_j, 0 where nothing was observed."""
@@ -389,8 +389,8 @@ class OpenCLEngine:
         """Return the objective recorded last, scaled."""
         return float(self.objectives(int(self._steps.recorded) - 1)[-1])
 
-    def extended(self) -> Array:
-        """Return the extended source, on the grid and scaled."""
+    def extended(self) -> NDArray[np.floating]:
+        """Return the extended source, on the grid and scaled, in the precision of the device."""
         return self._memory.download_pixels("extended")
 
     def star_fluxes(self) -> Array:

@@ -91,11 +91,10 @@ class PixelLayout:
         step = 2 * self.pixels_shape[-1] * max(1, n_bytes // self.block_bytes)
         return (slice(first, first + step) for first in range(0, n_rows, step))
 
-    def unpack_pixels(self, packed: NDArray) -> NDArray[np.float64]:
+    def unpack_pixels(self, packed: NDArray) -> NDArray:
         """Return the rows of pixels (..., Nx) that blocks in the kernels' order hold."""
         _, nx, _, block = self.pixels_shape
-        pairs = np.swapaxes(packed.reshape(-1, nx, 2, block), -3, -1)
-        return pairs.astype(np.float64).reshape(-1, nx)
+        return np.swapaxes(packed.reshape(-1, nx, 2, block), -3, -1).reshape(-1, nx)
 
 
 class Layout(PixelLayout):

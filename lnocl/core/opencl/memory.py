@@ -107,9 +107,9 @@ class Memory:
             cl.enqueue_copy(self._queue, values, self.buffers[name])
         return values.astype(np.float64)
 
-    def download_pixels(self, name: str) -> Array:
-        """Return the one array of pixels that a buffer holds, as float64."""
-        pixels, offset = np.empty(self._layout.grid), 0
+    def download_pixels(self, name: str) -> NDArray:
+        """Return the one array of pixels that a buffer holds, in the precision of the device."""
+        pixels, offset = np.empty(self._layout.grid, self._layout.dtype), 0
         for rows in self._layout.row_slices(len(pixels), MAX_COPIED):
             packed = np.empty(pixels[rows].size, self._layout.dtype)
             cl.enqueue_copy(self._queue, packed, self.buffers[name], src_offset=offset)

@@ -68,7 +68,7 @@ class Halves:
     """
 
     def __init__(self, starts: Sequence[Start], n_iter: int, stride: int, first: int = 0) -> None:
-        self._start, self._n_iter, self._stride = starts[0], n_iter, stride
+        self._n_iter, self._stride = n_iter, stride
         self._runs = [Run(start, n_iter - first, half) for half, start in enumerate(starts)]
         self._going = [iter(run) for run in self._runs]
         self.first = self.done = first
@@ -120,12 +120,9 @@ class Halves:
 
     def snapshot(self) -> Snapshot:
         """Return the estimates as they are."""
-        extended = np.empty((2, *self._runs[0].scene.grid), _dtype(self._start))
-        for half, run in zip(extended, self._runs, strict=True):
-            half[:] = run.engine.extended()
         return Snapshot(
             self.done,
-            extended,
+            np.array([run.engine.extended() for run in self._runs]),
             np.array([run.engine.star_fluxes() for run in self._runs]),
             np.array([run.scene.stars for run in self._runs]),
         )
@@ -190,12 +187,6 @@ def unpack(name: str, state: State) -> list[Snapshot]:
     """Return the snapshots that are saved under a name."""
     iterations, *others = (state.get(f"{name}_{field}", ()) for field in Snapshot._fields)
     return list(map(Snapshot, map(int, iterations), *others))
-
-
-def _dtype(start: Start) -> np.dtype:
-    """Return the type of the extended sources: that of the device."""
-    is_single = start.setup.engine == "opencl" and start.setup.precision == "single"
-    return np.dtype(np.float32 if is_single else np.float64)
 
 
 def next_snapshot(iteration: int) -> int:

@@ -242,7 +242,7 @@ class Run:
 
     def _refine(self) -> None:
         """Move the stars to where they are most likely, given the current extended source."""
-        extended = self.engine.extended()
+        extended = self._extended()
         refuse_not_finite(extended.sum())
         shared = self._setup, self.scene, self._model, extended
         star_fluxes = move_stars(*shared, self.engine.star_fluxes())
@@ -254,8 +254,11 @@ class Run:
 
     def estimate(self) -> Estimate:
         """Return the estimate on the grid."""
-        extended, fluxes = self.engine.extended(), self.engine.star_fluxes()
-        return Estimate.of_scaled(self.scene, extended, fluxes)
+        return Estimate.of_scaled(self.scene, self._extended(), self.engine.star_fluxes())
+
+    def _extended(self) -> Array:
+        """Return the extended source on the grid, scaled, in double precision."""
+        return self.engine.extended().astype(np.float64)
 
     def star_positions(self) -> Array:
         """Return the star positions, pixels, shape (n, 2)."""
@@ -264,7 +267,7 @@ class Run:
     def extended(self) -> Array:
         """Return the extended source, electrons per pixel of it."""
         ny, nx = self.scene.observation.sky_shape
-        return self.engine.extended()[:ny, :nx] * self.scene.unit
+        return self._extended()[:ny, :nx] * self.scene.unit
 
     def star_fluxes(self) -> Array:
         """Return the star fluxes, electrons."""

@@ -125,7 +125,8 @@ class Discrepancy(Rule):
         if self._model is None or self._stars is not run.scene.stars:  # they may have moved
             self._model, self._stars = Model(run.scene), run.scene.stars
         weights = self._model.weights
-        means = weights * self._model.images(run.engine.extended(), run.engine.star_fluxes())
+        extended = run.engine.extended().astype(np.float64)
+        means = weights * self._model.images(extended, run.engine.star_fluxes())
         return float(expected_deviance(means * run.scene.scale)[weights > 0].sum())
 
 
