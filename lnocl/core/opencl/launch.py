@@ -84,7 +84,8 @@ class Launch:
         arguments: Mapping[str, Any],
         groups: int,
     ) -> None:
-        self._queue, self._kernel = queue, program.kernel(name)
+        # The program has the kernel for as long as it is held.
+        self._queue, self._program, self._kernel = queue, program, program.kernel(name)
         self._real = program.dtype.type
         self._index = {each: index for index, each in enumerate(program.arguments[name])}
         group = program.tuning.group

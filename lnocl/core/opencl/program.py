@@ -7,7 +7,7 @@ import mmap
 import os
 import re
 import weakref
-from collections import OrderedDict
+from collections import OrderedDict, defaultdict
 from collections.abc import Mapping
 from functools import lru_cache
 from pathlib import Path
@@ -170,12 +170,12 @@ class Program:
         self.arguments = _arguments(text, tuple(self._built.kernel_names))
         self._kernels: dict[str, cl.Kernel] = {}
         weakref.finalize(self, self._built.store)
+        weakref.finalize(self, self._built.take_back, self._kernels)
 
     def kernel(self, name: str) -> cl.Kernel:
         """Return a kernel, always the same one."""
         if name not in self._kernels:
-            self._kernels[name] = cl.Kernel(self._built.program, name)
-            self._built.used.add(name)
+            self._kernels[name] = self._built.kernel(name)
         return self._kernels[name]
 
     @property
@@ -246,6 +246,23 @@ class _Built:
         self.kernel_names = str(self.program.get_info(cl.program_info.KERNEL_NAMES)).split(";")
         self.used: set[str] = set()
         self._looked_at: set[str] = set()
+        self._idle: dict[str, list[cl.Kernel]] = defaultdict(list)
+
+    def kernel(self, name: str) -> cl.Kernel:
+        """Return a kernel that nothing else launches, an idle one where there is one.
+
+        PyOpenCL takes half a millisecond to make one.
+        """
+        self.used.add(name)
+        try:
+            return self._idle[name].pop()
+        except IndexError:
+            return cl.Kernel(self.program, name)
+
+    def take_back(self, kernels: Mapping[str, cl.Kernel]) -> None:
+        """Have kernels that nothing launches any more for the next program."""
+        for name, kernel in kernels.items():
+            self._idle[name].append(kernel)
 
     def _load(self, context: cl.Context, options: tuple[str, ...]) -> cl.Program | None:
         if not self._content:

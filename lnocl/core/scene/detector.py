@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from lnocl.core.scene.arrays import Array
 from lnocl.core.scene.observation import Observation
-from lnocl.core.scene.shifting import ENDLESS, Cutout, MovablePsf
+from lnocl.core.scene.shifting import ENDLESS, Cutout, MovablePsf, movable_psf
 
 
 def movable_psfs(
@@ -19,7 +19,7 @@ def movable_psfs(
 ) -> list[MovablePsf | DetectorPsf]:
     """Return PSFs to be placed on the images' grid, as its pixels see them."""
     if observation.oversample == 1:
-        return [MovablePsf(psf, grid) for psf in psfs]
+        return [movable_psf(psf, grid) for psf in psfs]
     oversample, are_effective = observation.oversample, observation.effective_psfs
     return [DetectorPsf(psf, grid, oversample, are_effective) for psf in psfs]
 
@@ -100,7 +100,7 @@ class DetectorPsf:
         self, psf: Array, grid: tuple[int, int], oversample: int, is_effective: bool
     ) -> None:
         self._q, self._fine_grid = oversample, (oversample * grid[0], oversample * grid[1])
-        self.fine, self._is_effective = MovablePsf(psf, self._fine_grid), is_effective
+        self.fine, self._is_effective = movable_psf(psf, self._fine_grid), is_effective
         # From the middle of a pixel to the first of its fine pixels, in these.
         self._half = (oversample - 1) / 2.0
         self._lag = self._half if is_effective else 0.0

@@ -23,7 +23,7 @@ from lnocl.core.scene.psf_field import Psfs
 from lnocl.core.scene.rotation import Rotation, turned_psf
 from lnocl.core.scene.scaled_penalty import scaled
 from lnocl.core.scene.scene_check import warn_of_scene
-from lnocl.core.scene.shifting import Cutout, MovablePsf
+from lnocl.core.scene.shifting import Cutout, MovablePsf, movable_psf
 from lnocl.core.scene.star_psfs import StarPsfs, owned
 from lnocl.core.scene.star_weights import OBSERVED_SHARE, weigh_stars
 from lnocl.core.scene.stars import Covered, StarField, check_positions, covered_box
@@ -231,12 +231,12 @@ class Scene:
     @cached_property
     def _psfs_of_sky(self) -> list[MovablePsf]:
         """Those, times the relative exposure of their image where that is a number."""
-        return [MovablePsf(psf, self.grid) for psf in self.scaled_psfs(self.psfs_of_sky())]
+        return [movable_psf(psf, self.grid) for psf in self.scaled_psfs(self.psfs_of_sky())]
 
     @cached_property
     def _responses_of_sky(self) -> list[MovablePsf]:
         """The same with the pixels of the images."""
-        return [MovablePsf(psf, self.grid) for psf in self.scaled_psfs(self.psfs_of_sky(True))]
+        return [movable_psf(psf, self.grid) for psf in self.scaled_psfs(self.psfs_of_sky(True))]
 
     def _penalise(self, penalty: Penalty) -> None:
         self.penalty = penalty

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lnocl.core.scene.arrays import Array
+from lnocl.core.scene.remembered import remembered
 
 # Pixels added on each side of a PSF before it is moved by a fraction: ringing beyond the edges of
 # its array dies out in them.
@@ -195,6 +196,12 @@ class MovablePsf:
             psf = _widen(psf, n, i)
         variances = _variance(self._psf.sum(axis=-1)), _variance(self._psf.sum(axis=-2))
         return _Spectrum(psf, variances)
+
+
+@remembered(2**24)  # scenes of one call have the same
+def movable_psf(psf: Array, grid: tuple[int, int]) -> MovablePsf:
+    """Return a `MovablePsf`."""
+    return MovablePsf(psf.copy(), grid)
 
 
 def place(psf: Array, grid: tuple[int, int], x: float, y: float, axis: int | None = None) -> Cutout:

@@ -137,11 +137,12 @@ class StarImages:
                 here = sorted(rows_of.keys() & columns_of.keys())
                 if not here:
                     continue
-                lighting, slots = np.unique([owners[i] for i in here], return_inverse=True)
+                lighting = sorted({owners[i] for i in here})
+                slots = {owner: slot for slot, owner in enumerate(lighting)}
                 size = rows.stop - rows.start, columns.stop - columns.start
                 images = np.zeros((len(lighting), self._k, *size))
-                for i, slot in zip(here, slots, strict=True):
-                    values = pieces[i].values
+                for i in here:
+                    slot, values = slots[owners[i]], pieces[i].values
                     for to_y, from_y in rows_of[i]:
                         for to_x, from_x in columns_of[i]:
                             images[slot, : len(values), to_y, to_x] += values[:, from_y, from_x]

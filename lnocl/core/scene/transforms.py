@@ -283,4 +283,4 @@ def part(array: NDArray[Any], rows: range, columns: range, fill: float = 0.0) ->
         widths.append((before, len(at) - before - (last - first)))
     y, x = inside
     held = array[..., y, x]
-    return np.pad(held, widths, constant_values=fill) if np.any(widths) else held
+    return np.pad(held, widths, constant_values=fill) if any(map(any, widths)) else held

@@ -135,8 +135,8 @@ def with_errors(observation: Observation, theta: Array) -> Observation:
         changed = stack.copy()
         for k, psf in enumerate(stack):
             spectrum, stretches, blurs, _ = _spectra(psf, error)
-            spectrum = spectrum + np.tensordot(by_stretch, stretches, axes=1)
-            blurred = spectrum * np.exp(np.tensordot(by_blur, blurs, axes=1))
+            spectrum = spectrum + np.einsum("k,kvu->vu", by_stretch, stretches)
+            blurred = spectrum * np.exp(np.einsum("k,kvu->vu", by_blur, blurs))
             [changed[k]] = _from_spectra([blurred], psf)
         changed = np.where(stack < 0, changed, changed.clip(0.0))
         light = stack.sum(axis=(1, 2), keepdims=True)
