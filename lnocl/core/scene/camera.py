@@ -20,7 +20,7 @@ from copy import copy
 from functools import cached_property
 from itertools import groupby
 from types import EllipsisType
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import scipy.fft
@@ -58,6 +58,14 @@ class LinearMap:
     _seen: Part = ...  # where the image does
     _oversample = 1
     transmission: Array | None = None
+
+    def single(self) -> Self:
+        """Return the map for skies and images in single precision."""
+        other = copy(self)
+        other._otf = self._otf.astype(np.complex64)
+        if self.transmission is not None:
+            other.transmission = self.transmission.astype(np.float32)
+        return other
 
     def forward(self, sky: Array) -> Array:
         """Return the image of a sky."""
@@ -100,7 +108,7 @@ class LinearMap:
     def _transform(self, values: Array, there: Part) -> Spectrum:
         laid = values
         if there is not ...:
-            laid = np.zeros((*values.shape[:-2], *self._grid))
+            laid = np.zeros((*values.shape[:-2], *self._grid), values.dtype)
             laid[_each(there)] = values
         return np.asarray(scipy.fft.rfft2(laid, workers=threads(self._grid)))
 

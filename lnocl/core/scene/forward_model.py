@@ -84,6 +84,12 @@ class Model:
         other.scene, other.background = scene, self.background + np.array(more)
         return other
 
+    def single(self) -> Model:
+        """Return the model for skies and images in single precision."""
+        other = copy(self)
+        other.cameras = [camera.single() for camera in self.cameras]
+        return other
+
     @cached_property
     def of_ones(self) -> list[Array | float]:
         """What a sky of ones is in each image: a number where it stays flat."""
@@ -91,7 +97,7 @@ class Model:
 
     def forward(self, extended: Array) -> Array:
         """Return the ``A_j f``, shape (p, ny, nx)."""
-        images = np.empty(self.shape)
+        images = np.empty(self.shape, extended.dtype)
         for image, seen in zip(images, images_of(self.cameras, extended), strict=True):
             image[:] = seen
         return images

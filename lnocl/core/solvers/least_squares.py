@@ -94,7 +94,8 @@ class SourceError:
     adjoint : callable
         Returns ``sum_j A_j^T y_j``, shape (Ny, Nx), of p images y.
     amplitude : ndarray of float64, shape (Ny, Nx)
-        The standard deviation a of the error, in the unit of the sky.
+        The standard deviation a of the error, in the unit of the sky. What it is held in is the
+        precision of `forward` and `adjoint` too.
     width : float
         Pixels over which it is correlated (`lnocl.core.scene.smooth_field.SmoothField`).
 
@@ -114,7 +115,7 @@ class SourceError:
         width: float,
     ) -> None:
         self.images_of, self._adjoint, self._amplitude = forward, adjoint, amplitude
-        self._smooth = SmoothField(amplitude.shape, width)
+        self._smooth = SmoothField(amplitude.shape, width, amplitude.dtype)
         self.at = np.zeros(amplitude.shape)
 
     def forward(self, x: Array) -> Array:
@@ -127,7 +128,8 @@ class SourceError:
 
     def adjoint(self, images: Sequence[Array]) -> Array:
         """Return the transpose of `forward` applied to images, shape (Ny, Nx)."""
-        return self._smooth.apply(self._amplitude * self._adjoint(images))
+        rounded = (np.asarray(image, self._amplitude.dtype) for image in images)
+        return self._smooth.apply(self._amplitude * self._adjoint(rounded))
 
 
 class LeastSquares:

@@ -117,8 +117,10 @@ def _fit(images: list[LinearImage], fields: Sequence[Field], prior: Array) -> Le
 
 
 def _source_error(model: Model, extended: Array) -> SourceError:
+    # In single precision: conjugate gradients end long before its rounding.
+    single, width = model.single(), CORRELATED * model.oversample
     amplitude = gaussian_filter(extended, SMOOTHED * model.oversample, mode="wrap")
-    return SourceError(model.forward, model.adjoint, amplitude, CORRELATED * model.oversample)
+    return SourceError(single.forward, single.adjoint, amplitude.astype(np.float32), width)
 
 
 def _linearise(
