@@ -4,6 +4,14 @@ typedef struct {
     vec re, im;
 } cvec;
 
+/* A vector of the reals from p on, which need not lie where vectors do. */
+#if LANES == 1
+#define LOAD_UNALIGNED(p) (*(p))
+#else
+typedef vec unaligned_vec __attribute__((aligned(sizeof(real))));
+#define LOAD_UNALIGNED(p) (*(__global const unaligned_vec *)(p))
+#endif
+
 /* Point i of a block; x is already at this work-item's vector of the block. */
 #define LOAD(x, i) ((cvec){(x)[2 * (i) * SIDE], (x)[(2 * (i) + 1) * SIDE]})
 #define STORE(x, i, value)                      \

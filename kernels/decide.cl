@@ -234,7 +234,7 @@ INLINE void decide(__global real *steps, __global real *objectives, const real_s
  * objectives: [iterations + 1][2], a compensated pair each; entry steps[RECORDED] is written.
  * data_term: [2], J_0. star_totals: [n_stars][2]. star_corrections, star_weights: [n_stars].
  * ratio_sums: [IMAGE_ROW_BLOCKS][n_images][2]. star_sums: [n_stars][n_images][star_blocks][2].
- * square_sums (HAS_MU), smooth_sums (HAS_SMOOTHING): [ROW_BLOCKS][2].
+ * square_sums (mu not 0), smooth_sums (is_smoothed): [ROW_BLOCKS][2].
  * Launch: up to n_stars groups, at least one. Out of place.
  * Twin: reference.collect_sums.
  */
@@ -244,22 +244,19 @@ KERNEL void collect_sums(
     __global real *restrict star_corrections, __global const real *restrict ratio_sums,
     __global const real *restrict star_sums, __global const real *restrict square_sums,
     __global const real *restrict smooth_sums, __global const real *restrict star_weights,
-    const real mu, const int n_images, const int n_stars, const int star_blocks)
+    const int is_smoothed, const real mu, const int n_images, const int n_stars,
+    const int star_blocks)
 {
     SHARED_SUMS(shared);
     /* Every group makes the objective: a barrier in a branch stops PoCL. */
     const real_sum data = sum_group(sum_pairs(ratio_sums, IMAGE_ROW_BLOCKS * n_images), shared);
     real_sum objective = data;
-#if HAS_MU
-    real_sum squares = sum_group(sum_pairs(square_sums, ROW_BLOCKS), shared);
+    real_sum squares = sum_group(sum_pairs(square_sums, mu != 0 ? ROW_BLOCKS : 0), shared);
     squares.sum *= mu / 2;
     squares.lost *= mu / 2;
     MERGE(objective, squares);
-#endif
-#if HAS_SMOOTHING
-    const real_sum smooth = sum_group(sum_pairs(smooth_sums, ROW_BLOCKS), shared);
+    const real_sum smooth = sum_group(sum_pairs(smooth_sums, is_smoothed ? ROW_BLOCKS : 0), shared);
     MERGE(objective, smooth);
-#endif
     if (get_group_id(0) == 0) {
         store_pair(data_term, data);
         if (ITEM == 0)

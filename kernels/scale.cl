@@ -16,6 +16,36 @@ INLINE cvec inverse_weight_at(
 #endif
 }
 
+/* Scales the points x, x + INNER(NX), ... of a line, whose corrections c a[] has, in place; their sum of
+ * f^2. It is called with a literal is_smoothed, and mu 0: branches in the loop would leave a[] in memory.
+ */
+INLINE vec scale_points(
+    cvec *a, __global vec *extended, __global const vec *inverse_weight, __global const vec *slope,
+    __global const vec *curvature, const int x, const int n_images, const int is_smoothed,
+    const real mu)
+{
+    vec squares = 0;
+    UNROLL_IN_GROUPS
+    for (int q = 0; q < OUTER(NX); ++q) {
+        const int pixel = q * INNER(NX) + x;
+        const cvec f = LOAD(extended, pixel);
+        const cvec weight = inverse_weight_at(inverse_weight, pixel, n_images);
+        const cvec curved = smoothing_at(curvature, pixel, is_smoothed);
+        const cvec down = smoothing_at(slope, pixel, is_smoothed);
+        a[q].re += curved.re * f.re - down.re;
+        a[q].im += curved.im * f.im - down.im;
+        a[q].re = f.re * not_below_0(1 + weight.re * a[q].re);
+        a[q].im = f.im * not_below_0(1 + weight.im * a[q].im);
+        if (is_smoothed || mu != 0) {
+            a[q].re /= 1 + (mu + curved.re) * f.re * weight.re;
+            a[q].im /= 1 + (mu + curved.im) * f.im * weight.im;
+        }
+        squares += a[q].re * a[q].re + a[q].im * a[q].im;
+        STORE(extended, pixel, a[q]);
+    }
+    return squares;
+}
+
 /* f <- f (1 + a u) / (1 + (mu + curvature) f a), u = c + curvature f - slope,
  * c = sum_j A_j^T (r_j - w_j), a = 1 / sum_j A_j^T w_j, and 1 + a u not below 0;
  * spectra <- row spectrum of the new f; square_sums: sum f^2; the stars, with p_s = star_weights_s:
@@ -23,7 +53,7 @@ INLINE cvec inverse_weight_at(
  * spectra: one array, in: row spectrum of c, out: twice the row spectrum of f.
  * extended: one array of pixels, f. inverse_weight: one array of pixels, a (HAS_WEIGHTS; else
  * a = 1 / n_images). slope, curvature: one array of pixels each, const, those of f
- * (HAS_SMOOTHING; else they count as 0). square_sums: [ROW_BLOCKS][2] (HAS_MU).
+ * (is_smoothed; else they count as 0). square_sums: [ROW_BLOCKS][2].
  * star_fluxes, star_corrections, star_weights, prior_fluxes, prior_precision: [n_stars].
  * steps[GOING] 0: nothing.
  * Launch: up to ROW_BLOCKS groups. In place. Scratch: NX points. Twin: reference.scale_rows.
@@ -34,54 +64,36 @@ KERNEL void scale_rows(
     __global const vec *restrict inverse_weight, __global const real *restrict star_corrections,
     __global const real *restrict star_weights, __global const real *restrict prior_fluxes,
     __global const real *restrict prior_precision, __global const vec *restrict slope,
-    __global const vec *restrict curvature, __global const real *restrict steps, const real mu,
-    const int n_images, const int n_stars, __global const real *restrict row_roots,
-    SCRATCH vec *restrict scratch)
+    __global const vec *restrict curvature, __global const real *restrict steps,
+    const int is_smoothed, const real mu, const int n_images, const int n_stars,
+    __global const real *restrict row_roots, SCRATCH vec *restrict scratch)
 {
     SHARED_SUMS(shared);
     SCRATCH vec *z = OWN_SCRATCH(scratch, NX);
     FOR_EACH_BLOCK_IF(steps[GOING], block, ROW_BLOCKS) {
         const size_t at = (size_t)block * NX * 2 * SIDE;
-        __global vec *source = extended + at;
         read_tiles(z, spectra, block);
         dit_inner(z, NX, row_roots);
         vec_sum total = {0, 0};
         FOR_EACH(piece, INNER(NX) * SIDE) {
             const int x = piece / SIDE, lane = piece % SIDE;
             cvec a[OUTER(NX)];
+            vec squares;
             load_inverse(a, z + lane, x, NX, row_roots);
-            vec part = 0;
+            __global vec *source = extended + at + lane;
+            __global const vec *weight = inverse_weight + at + lane;
+            __global const vec *down = slope + at + lane, *curved = curvature + at + lane;
             /* A pass of its own over the pixels takes longer here. */
-            UNROLL_IN_GROUPS
-            for (int q = 0; q < OUTER(NX); ++q) {
-                const int pixel = q * INNER(NX) + x;
-                const cvec f = LOAD(source + lane, pixel);
-                const cvec weight = inverse_weight_at(inverse_weight + at + lane, pixel, n_images);
-                const cvec curved = smoothing_at(curvature + at + lane, pixel);
-#if HAS_SMOOTHING
-                const cvec down = smoothing_at(slope + at + lane, pixel);
-                a[q].re += curved.re * f.re - down.re;
-                a[q].im += curved.im * f.im - down.im;
-#endif
-                a[q].re = f.re * not_below_0(1 + weight.re * a[q].re);
-                a[q].im = f.im * not_below_0(1 + weight.im * a[q].im);
-#if HAS_PENALTY
-                a[q].re /= 1 + penalty_weight(mu, curved.re) * f.re * weight.re;
-                a[q].im /= 1 + penalty_weight(mu, curved.im) * f.im * weight.im;
-#endif
-#if HAS_MU
-                part += a[q].re * a[q].re + a[q].im * a[q].im;
-#endif
-                STORE(source + lane, pixel, a[q]);
-            }
-#if HAS_MU
-            ACCUMULATE(total, part);
-#endif
+            if (is_smoothed)
+                squares = scale_points(a, source, weight, down, curved, x, n_images, 1, mu);
+            else if (mu != 0)
+                squares = scale_points(a, source, weight, down, curved, x, n_images, 0, mu);
+            else
+                squares = scale_points(a, source, weight, down, curved, x, n_images, 0, 0);
+            ACCUMULATE(total, squares);
             store_forward(z + lane, a, x, NX, row_roots);
         }
-#if HAS_MU
         store_pair(square_sums + 2 * block, sum_group(sum_lanes(total), shared));
-#endif
         BARRIER;
         dif_inner(z, NX, row_roots);
         write_tiles(spectra, z, block, 1);

@@ -1,14 +1,13 @@
 /* A step of the scaled gradient projection method, inside the transforms along the rows. */
 
 INLINE vec shifted_scaling(
-    const vec f, const vec shift, const vec weight, const vec curvature, const real mu)
+    const vec f, const vec shift, const vec weight, const vec curvature, const int is_smoothed,
+    const real mu)
 {
     const vec scaled = (f + shift) * weight;
-#if HAS_PENALTY
-    return scaled / (1 + penalty_weight(mu, curvature) * scaled);
-#else
+    if (is_smoothed || mu != 0)
+        return scaled / (1 + (mu + curvature) * scaled);
     return scaled;
-#endif
 }
 
 /* D = (f + z) a / (1 + (mu + curvature) (f + z) a): a split gradient's own scaling, shifted by z.
@@ -16,28 +15,16 @@ INLINE vec shifted_scaling(
  */
 INLINE cvec scaling_at(
     const cvec f, __global const vec *shift, __global const vec *inverse_weight,
-    __global const vec *curvature, const size_t from, const int pixel, const real mu,
-    const int n_images)
+    __global const vec *curvature, const size_t from, const int pixel, const int is_smoothed,
+    const real mu, const int n_images)
 {
     const cvec z = LOAD(shift + from, pixel);
     const cvec weight = inverse_weight_at(inverse_weight + from, pixel, n_images);
-    const cvec curved = smoothing_at(curvature + from, pixel);
+    const cvec curved = smoothing_at(curvature + from, pixel, is_smoothed);
     return (cvec){
-        shifted_scaling(f.re, z.re, weight.re, curved.re, mu),
-        shifted_scaling(f.im, z.im, weight.im, curved.im, mu)
+        shifted_scaling(f.re, z.re, weight.re, curved.re, is_smoothed, mu),
+        shifted_scaling(f.im, z.im, weight.im, curved.im, is_smoothed, mu)
     };
-}
-
-/* mu f + slope - c. */
-INLINE vec next_gradient(const vec correction, const vec f, const vec slope, const real mu)
-{
-#if HAS_SMOOTHING
-    return mu * f + slope - correction;
-#elif HAS_MU
-    return mu * f - correction;
-#else
-    return -correction;
-#endif
 }
 
 /* gradient' = mu f + slope - c, c = sum_j A_j^T (r_j - w_j);
@@ -45,7 +32,7 @@ INLINE vec next_gradient(const vec correction, const vec f, const vec slope, con
  * D = (f + shift) a / (1 + (mu + curvature) (f + shift) a), a = 1 / sum_j A_j^T w_j.
  * spectra: one array, const, row spectrum of c. gradient: one array of pixels, updated. extended
  * (f), previous, shift: one each, const. inverse_weight: one array of pixels, a (HAS_WEIGHTS; else
- * a = 1 / n_images). slope, curvature: one array of pixels each, const, those of f (HAS_SMOOTHING;
+ * a = 1 / n_images). slope, curvature: one array of pixels each, const, those of f (is_smoothed;
  * else they count as 0). change_sums: [2][ROW_BLOCKS][2]. steps[FRESH] 0: nothing.
  * Launch: up to ROW_BLOCKS groups. In place. Scratch: NX points. Twin: reference.gradient_rows.
  */
@@ -54,8 +41,9 @@ KERNEL void gradient_rows(
     __global vec *restrict gradient, __global const vec *restrict extended,
     __global const vec *restrict previous, __global const vec *restrict shift,
     __global const vec *restrict inverse_weight, __global const vec *restrict slope,
-    __global const vec *restrict curvature, __global const real *restrict steps, const real mu,
-    const int n_images, __global const real *restrict row_roots, SCRATCH vec *restrict scratch)
+    __global const vec *restrict curvature, __global const real *restrict steps,
+    const int is_smoothed, const real mu, const int n_images,
+    __global const real *restrict row_roots, SCRATCH vec *restrict scratch)
 {
     SHARED_SUMS(shared);
     SCRATCH vec *z = OWN_SCRATCH(scratch, NX);
@@ -71,12 +59,10 @@ KERNEL void gradient_rows(
             const cvec f = LOAD(extended + at + lane, pixel);
             const cvec before = LOAD(previous + at + lane, pixel);
             const cvec g = LOAD(gradient + at + lane, pixel);
-            const cvec down = smoothing_at(slope + at + lane, pixel);
-            const cvec d =
-                scaling_at(f, shift, inverse_weight, curvature, at + lane, pixel, mu, n_images);
-            const cvec next = {
-                next_gradient(a.re, f.re, down.re, mu), next_gradient(a.im, f.im, down.im, mu)
-            };
+            const cvec down = smoothing_at(slope + at + lane, pixel, is_smoothed);
+            const cvec d = scaling_at(
+                f, shift, inverse_weight, curvature, at + lane, pixel, is_smoothed, mu, n_images);
+            const cvec next = {mu * f.re + down.re - a.re, mu * f.im + down.im - a.im};
             const cvec change = {d.re * (next.re - g.re), d.im * (next.im - g.im)};
             ACCUMULATE(
                 change_step, change.re * (f.re - before.re) + change.im * (f.im - before.im));
@@ -99,7 +85,7 @@ KERNEL void gradient_rows(
  * for gradient_rows, which has D and change_sums. steps[GOING] 0: nothing. cross_information: [n_stars], a window of cross_blocks blocks and cross_columns
  * columns each; cross_corners: [n_stars][2]; cross_near: the stars of each block, see stars.cl.
  * coupling_sums: [n_stars][cross_blocks][2].
- * step_sums, square_sums (HAS_MU): [ROW_BLOCKS][2].
+ * step_sums, square_sums: [ROW_BLOCKS][2].
  * Launch: up to ROW_BLOCKS groups. In place. Scratch: NX points. Twin: reference.step_rows.
  */
 KERNEL void step_rows(
@@ -110,9 +96,9 @@ KERNEL void step_rows(
     __global const vec *restrict inverse_weight, __global const vec *restrict curvature,
     __global const vec *restrict cross_information, __global const int *restrict cross_corners,
     __global const int *restrict cross_near, __global const real *restrict steps,
-    __global const real *restrict change_sums, const real mu, const int n_images,
-    const int cross_blocks, const int cross_columns, __global const real *restrict row_roots,
-    SCRATCH vec *restrict scratch)
+    __global const real *restrict change_sums, const int is_smoothed, const real mu,
+    const int n_images, const int cross_blocks, const int cross_columns,
+    __global const real *restrict row_roots, SCRATCH vec *restrict scratch)
 {
     SHARED_SUMS(shared);
     SCRATCH vec *z = OWN_SCRATCH(scratch, NX);
@@ -129,8 +115,8 @@ KERNEL void step_rows(
             const int pixel = piece / SIDE, lane = piece % SIDE;
             const cvec f = LOAD(extended + at + lane, pixel);
             const cvec g = LOAD(gradient + at + lane, pixel);
-            const cvec scale =
-                scaling_at(f, shift, inverse_weight, curvature, at + lane, pixel, mu, n_images);
+            const cvec scale = scaling_at(
+                f, shift, inverse_weight, curvature, at + lane, pixel, is_smoothed, mu, n_images);
             const cvec trial = {
                 not_below_0(f.re - alpha * scale.re * g.re),
                 not_below_0(f.im - alpha * scale.im * g.im)
@@ -141,9 +127,8 @@ KERNEL void step_rows(
             ACCUMULATE(slope_total, g.re * d.re + g.im * d.im);
             if (has_stars)
                 STORE(z + lane, pixel, d);
-#if HAS_MU
-            ACCUMULATE(square_total, trial.re * trial.re + trial.im * trial.im);
-#endif
+            if (mu != 0)
+                ACCUMULATE(square_total, trial.re * trial.re + trial.im * trial.im);
         }
         FOR_EACH(piece, is_new ? 0 : NX * SIDE) {
             const int pixel = piece / SIDE, lane = piece % SIDE;
@@ -155,9 +140,8 @@ KERNEL void step_rows(
             STORE(extended + at + lane, pixel, trial);
             if (has_stars) /* which know how they follow */
                 STORE(z + lane, pixel, trial);
-#if HAS_MU
-            ACCUMULATE(square_total, trial.re * trial.re + trial.im * trial.im);
-#endif
+            if (mu != 0)
+                ACCUMULATE(square_total, trial.re * trial.re + trial.im * trial.im);
         }
         BARRIER;
         sum_products(
@@ -171,9 +155,7 @@ KERNEL void step_rows(
             store_forward(z + lane, a, x, NX, row_roots);
         }
         store_pair(step_sums + 2 * block, sum_group(sum_lanes(slope_total), shared));
-#if HAS_MU
         store_pair(square_sums + 2 * block, sum_group(sum_lanes(square_total), shared));
-#endif
         BARRIER;
         dif_inner(z, NX, row_roots);
         write_tiles(spectra, z, block, 1);

@@ -28,13 +28,6 @@
 /* Columns lie far from each other in memory, as tiles do. */
 #define COLUMNS_AHEAD 16
 
-#if LANES == 1
-#define LOAD_UNALIGNED(p) (*(p))
-#else
-typedef vec unaligned_vec __attribute__((aligned(sizeof(real))));
-#define LOAD_UNALIGNED(p) (*(__global const unaligned_vec *)(p))
-#endif
-
 /* Reals that the columns of one image take. */
 #define COLUMNS_SIZE ((size_t)PIECES * NX * 2 * PIECE)
 

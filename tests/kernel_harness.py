@@ -22,6 +22,8 @@ from lnocl.core.scene.scene import MIN_MODEL
 from lnocl.core.scene.steps import Steps
 from lnocl.errors import DeviceError
 
+# What of a scene kernels are told as they are launched; with all else they are built.
+ARGUMENTS = "n_images", "n_stars", "has_mu", "has_smoothing", "has_smoothing_map"
 # Scenes with all parts, together, that a program can have.
 THREE_IMAGES = "three images, two stars, mask, background map, map of smoothing"
 TWICE_AS_FINE = "sky twice as fine, three images, two stars, mask, background map"
@@ -162,7 +164,7 @@ class KernelHarness:
     grid, dtype, tuning
         Grid of the sky; as for `lnocl.core.opencl.program.Program`.
     **scene
-        Parts of the scene, as for `lnocl.core.opencl.program.Program`, n_images and n_stars: one of
+        Parts of the scene, as for `lnocl.core.opencl.program.Program`, and `ARGUMENTS`: one of
         `SCENES`.
     """
 
@@ -175,7 +177,7 @@ class KernelHarness:
         **scene: Any,
     ) -> None:
         self.n_images, self.n_stars = scene.get("n_images", 1), scene.get("n_stars", 0)
-        parts = {name: has for name, has in scene.items() if name not in ("n_images", "n_stars")}
+        parts = {name: has for name, has in scene.items() if name not in ARGUMENTS}
         self.program = Program(context, grid, np.dtype(dtype), tuning, min_model=MIN_MODEL, **parts)
         self.layout, self.launcher = SpectraLayout(self.program), Launcher(self.program)
         self.dtype, self.grid, self.scene = self.program.dtype, grid, scene
@@ -203,6 +205,10 @@ class KernelHarness:
         Arguments that the scene has no use for are small arrays.
         """
         counts = {"n_images": self.n_images, "n_stars": self.n_stars, "first": 0}
+        counts |= {
+            "is_smoothed": int(self.scene.get("has_smoothing", False)),
+            "has_smoothing_map": int(self.scene.get("has_smoothing_map", False)),
+        }
         given = {**counts, "steps": self.put(Steps().numbers()), **arguments}
         for name in self.program.arguments[kernel]:
             if name not in given and name not in self.launcher.own:

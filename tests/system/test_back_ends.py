@@ -13,7 +13,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from kernel_cases import of_gpu
-from kernel_harness import THREE_IMAGES, TURNED
+from kernel_harness import ARGUMENTS, THREE_IMAGES, TURNED
 from kernel_scenes import FOUR_TIMES_AS_FINE, SCENES
 
 from lnocl.core.opencl import program
@@ -45,9 +45,9 @@ MAX_REGISTERS = {np.float32: 128, np.float64: 256}
 
 def options(monkeypatch, grid, scene, dtype):
     """Return the options with which a program for a GPU is built."""
-    built = SimpleNamespace(kernel_names=[], store=lambda: None)
+    built = SimpleNamespace(kernel_names=[], store=lambda: None, take_back=lambda _: None)
     monkeypatch.setattr(program, "_build", lambda *_: built)
-    parts = {k: v for k, v in SCENES[scene].items() if k not in ("n_images", "n_stars")}
+    parts = {k: v for k, v in SCENES[scene].items() if k not in ARGUMENTS}
     oversample = parts.get("oversample", 1)
     cut = of_gpu(*grid, oversample=oversample, dtype=dtype)
     assert cut.group > 1

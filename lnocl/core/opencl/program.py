@@ -71,7 +71,6 @@ class Program:
         By default that of `lnocl.core.opencl.tuning.tune`.
     oversample : int, optional
         Pixels of the sky to one of the images, along each axis: 1, 2 or 4.
-    has_mu, has_smoothing, has_smoothing_map : bool, optional
     has_weights, has_background_map, has_exposure_map, has_turns : bool, optional
         Parts that the scene has.
     min_model : float, optional
@@ -106,9 +105,6 @@ class Program:
         tuning: Tuning | None = None,
         *,
         oversample: int = 1,
-        has_mu: bool = False,
-        has_smoothing: bool = False,
-        has_smoothing_map: bool = False,
         has_weights: bool = False,
         has_background_map: bool = False,
         has_exposure_map: bool = False,
@@ -151,9 +147,6 @@ class Program:
             "NY": grid[0],
             "OVERSAMPLE": oversample,
             "ROWS": self.rows,
-            "HAS_MU": int(has_mu),
-            "HAS_SMOOTHING": int(has_smoothing),
-            "HAS_SMOOTHING_MAP": int(has_smoothing_map),
             "HAS_WEIGHTS": int(has_weights),
             "HAS_BACKGROUND_MAP": int(has_background_map),
             "HAS_EXPOSURE_MAP": int(has_exposure_map),
