@@ -66,9 +66,6 @@ class Engine(Protocol):
     def look(self) -> Steps:
         """Return what was decided; this waits for all ticks."""
 
-    def objective(self) -> float:
-        """Return the objective recorded last."""
-
     def objectives(self, first: int = 0) -> Array:
         """Return the objectives recorded, from one on; this waits for all ticks."""
 

@@ -257,10 +257,6 @@ class ReferenceEngine:
             length,
         )
 
-    def objective(self) -> float:
-        """Return the objective recorded last."""
-        return self._objectives[-1]
-
     def extended(self) -> Array:
         """Return the extended source, on the grid and scaled."""
         return self._extended.copy()

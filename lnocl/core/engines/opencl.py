@@ -321,9 +321,8 @@ class OpenCLEngine:
             extended = np.where(self._observed, extended, 0.0)
         memory.upload_pixels("extended", [extended])
         memory.upload("star_fluxes", star_fluxes)
-        squares = np.zeros(memory.count("square_sums"))
-        squares[0] = np.einsum("yx,yx->", extended, extended)
-        memory.upload("square_sums", squares)
+        memory.clear("square_sums")
+        memory.upload("square_sums", np.einsum("yx,yx->", extended, extended))
         self._judge_estimate(replace(self._first, recorded=recorded))
         if self.scaling is not None:
             memory.copy("extended", "previous")
@@ -383,10 +382,6 @@ class OpenCLEngine:
             self._memory.copy("previous", "extended")
             self._memory.copy("star_steps", "star_fluxes")
         return self._steps
-
-    def objective(self) -> float:
-        """Return the objective recorded last, scaled."""
-        return float(self.objectives(int(self._steps.recorded) - 1)[-1])
 
     def extended(self) -> NDArray[np.floating]:
         """Return the extended source, on the grid and scaled, in the precision of the device."""

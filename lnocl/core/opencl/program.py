@@ -237,8 +237,7 @@ class _Built:
             self.program = self._load(context, options) or _compile(context, text, options)
         # Not by all_kernels: its kernels are retained once too often, and stay with their program.
         self.kernel_names = str(self.program.get_info(cl.program_info.KERNEL_NAMES)).split(";")
-        self.used: set[str] = set()
-        self._looked_at: set[str] = set()
+        self.used, self._looked_at = set[str](), set[str]()
         self._idle: dict[str, list[cl.Kernel]] = defaultdict(list)
 
     def kernel(self, name: str) -> cl.Kernel:
@@ -247,10 +246,8 @@ class _Built:
         PyOpenCL takes half a millisecond to make one.
         """
         self.used.add(name)
-        try:
-            return self._idle[name].pop()
-        except IndexError:
-            return cl.Kernel(self.program, name)
+        idle = self._idle[name]
+        return idle.pop() if idle else cl.Kernel(self.program, name)
 
     def take_back(self, kernels: Mapping[str, cl.Kernel]) -> None:
         """Have kernels that nothing launches any more for the next program."""

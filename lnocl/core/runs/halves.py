@@ -129,13 +129,11 @@ class Halves:
 
     def extended(self) -> Array:
         """Return the sum of the extended sources, electrons per pixel, shape (ny, nx)."""
-        first, second = self._runs
-        return first.extended() + second.extended()
+        return np.sum([run.extended() for run in self._runs], axis=0)
 
     def star_fluxes(self) -> Array:
         """Return the sums of the star fluxes, electrons."""
-        first, second = self._runs
-        return first.star_fluxes() + second.star_fluxes()
+        return np.sum([run.star_fluxes() for run in self._runs], axis=0)
 
     def is_shown(self) -> NDArray[np.bool_]:
         """Return which stars, and halos, any image shows."""
@@ -151,8 +149,7 @@ class Halves:
 
     def objectives(self, last: int) -> Array:
         """Return the sums of the objectives, of where they started and all iterations up to one."""
-        first, second = (run.objectives()[: last - self.first + 1] for run in self._runs)
-        return first + second
+        return np.sum([run.objectives()[: last - self.first + 1] for run in self._runs], axis=0)
 
     def state(self) -> State:
         """Return the arrays that `restore` needs, as they are between iterations.

@@ -266,8 +266,7 @@ class Run:
 
     def extended(self) -> Array:
         """Return the extended source, electrons per pixel of it."""
-        ny, nx = self.scene.observation.sky_shape
-        return self._extended()[:ny, :nx] * self.scene.unit
+        return self.estimate().observed_sky
 
     def star_fluxes(self) -> Array:
         """Return the star fluxes, electrons."""
@@ -279,7 +278,7 @@ class Run:
 
     def objective(self) -> float:
         """Return the last objective."""
-        return self.engine.objective() * self.scene.scale
+        return float(self.objectives()[-1])
 
     def objectives(self) -> Array:
         """Return the objectives so far: of the start, and after each iteration."""

@@ -7,7 +7,7 @@ changed into each other here alone.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -58,14 +58,6 @@ class Estimate:
         """The part of the extended source that images show, of `Observation.sky_shape`."""
         ny, nx = self.scene.observation.sky_shape
         return self.sky[:ny, :nx]
-
-    def changed(self, sky: Array | None = None, star_fluxes: Array | None = None) -> Estimate:
-        """Return it with another extended source or other fluxes, electrons."""
-        return replace(
-            self,
-            sky=self.sky if sky is None else sky,
-            star_fluxes=self.star_fluxes if star_fluxes is None else star_fluxes,
-        )
 
     def models(self) -> Iterator[Array]:
         """Yield the m_j on the grid of the images, scaled; one alone is held."""

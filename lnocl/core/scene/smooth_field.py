@@ -24,9 +24,7 @@ class SmoothField:
         Of the arithmetic.
     """
 
-    def __init__(
-        self, shape: tuple[int, ...], width: float, dtype: DTypeLike = np.float64
-    ) -> None:
+    def __init__(self, shape: tuple[int, ...], width: float, dtype: DTypeLike = np.float64) -> None:
         self._shape, self._threads = shape, threads(shape)
         u, v = np.fft.rfftfreq(shape[1]), np.fft.fftfreq(shape[0])[:, None]
         root = np.exp(-((np.pi * width) ** 2) * (u**2 + v**2))

@@ -142,7 +142,7 @@ def marginal_halos(estimate: Estimate) -> Estimate:
         change = np.where(is_told, joint.change(), 0.0)
         change = np.append(dark, np.maximum(change, -estimate.fluxes[scene.n_stars :]))
         sky = without(estimate, model, model.starlight(change))
-        estimate = estimate.changed(sky, estimate.star_fluxes + change * scene.unit)
+        estimate = Estimate(scene, sky, estimate.star_fluxes + change * scene.unit)
         if (abs(change[scene.n_stars :]) * np.sqrt(information) < SETTLED).all():
             break
     return estimate

@@ -64,7 +64,7 @@ def marginal(estimate: Estimate) -> Estimate:
         light = np.maximum(light, -after[there])
         lost = float((star_fluxes[star] - fluxes[star]).mean()) * scene.share_shown(first)
         after[there] += _at_most(light, lost)
-    return estimate.changed(after, fluxes)
+    return Estimate(scene, after, fluxes)
 
 
 def _at_most(light: Array, total: float) -> Array:
