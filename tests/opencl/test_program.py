@@ -6,10 +6,15 @@ import numpy as np
 import pyopencl as cl
 import pytest
 
+import lnocl
+from lnocl.core.engines.opencl import OpenCLEngine
 from lnocl.core.opencl import program
 from lnocl.core.opencl.device import choose, context_of
+from lnocl.core.opencl.launch import Launcher
 from lnocl.core.opencl.program import Program
 from lnocl.core.opencl.tuning import Tuning
+from lnocl.core.scene.penalty import Penalty
+from lnocl.core.scene.scene import Scene
 
 
 @pytest.fixture
@@ -68,6 +73,30 @@ def test_kernels_and_their_program_are_let_go(context):
     """PyOpenCL's `Program.all_kernels` gives kernels that keep themselves and their program."""
     built = Program(context, (128, 64), np.dtype(np.float32))
     assert built.kernel("rfft_rows").reference_count == 1
+
+
+def test_kernels_that_nothing_launches_any_more_serve_the_next_program(context):
+    """Of two programs each has its own, and a launch has its kernel when its program is gone."""
+    first, second = (build(context) for _ in range(2))
+    kernels = {each.kernel("fft_columns").int_ptr for each in (first, second)}
+    assert len(kernels) == 2
+    del first, second
+    launcher = Launcher(build(context))
+    buffers = {"spectra": cl.Buffer(context, cl.mem_flags.READ_WRITE, 4096)}
+    launch = launcher.bind("fft_columns", buffers)
+    own = launch._kernel.int_ptr
+    assert own in kernels
+    del launcher
+    assert build(context).kernel("fft_columns").int_ptr == (kernels - {own}).pop()
+
+
+def test_runs_that_differ_in_their_penalty_share_a_program():
+    near = np.linspace(0.0, 0.1, 64).reshape(8, 8)
+    penalties = [{}, {"mu": 0.1}, {"smoothing": 0.1}, {"smoothing": 0.1, "near_stars": near}]
+    observation = lnocl.Observation(np.full((8, 8), 4.0), np.ones((1, 1)))
+    scenes = [Scene(observation, penalty=Penalty(**each)) for each in penalties]
+    engines = [OpenCLEngine(scene, "single", None, 1) for scene in scenes]
+    assert len({tuple(engine.program.options) for engine in engines}) == 1
 
 
 @pytest.mark.parametrize(

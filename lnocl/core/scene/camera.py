@@ -60,11 +60,12 @@ class LinearMap:
     transmission: Array | None = None
 
     def single(self) -> Self:
-        """Return the map for skies and images in single precision."""
+        """Return the map for skies and images in single precision.
+
+        Shears and transmissions are made in double precision all the same.
+        """
         other = copy(self)
         other._otf = self._otf.astype(np.complex64)
-        if self.transmission is not None:
-            other.transmission = self.transmission.astype(np.float32)
         return other
 
     def forward(self, sky: Array) -> Array:
@@ -449,7 +450,8 @@ def adjoints_of(cameras: Sequence[Camera], images: Iterable[Array], factors: Arr
             total += mixed_otf(seen_by, share) * spectrum
     if not spectra:
         return np.broadcast_to(flat[:, None, None], (len(flat), *grid))
-    return np.array([cameras[0].sky(each.conj()) for each in spectra]) + flat[:, None, None]
+    pairs = zip(spectra, flat.tolist(), strict=True)
+    return np.array([cameras[0].sky(each.conj()) + level for each, level in pairs])
 
 
 def mixed_otf(cameras: Sequence[Camera], shares: Array) -> Spectrum:
@@ -488,7 +490,8 @@ def spread(image: Array, oversample: int, beside: float = 0.0) -> Array:
     """Return the adjoint of `sampled`: the pixels of an image on the sky's, 0 between them."""
     if oversample == 1:
         return image
-    sky = np.full((*image.shape[:-2], *(oversample * n for n in image.shape[-2:])), beside)
+    shape = *image.shape[:-2], *(oversample * n for n in image.shape[-2:])
+    sky = np.full(shape, beside, image.dtype)
     sky[..., ::oversample, ::oversample] = image
     return sky
 
