@@ -1,19 +1,21 @@
 """Seconds of a default answer, and of a plain run of as many iterations with one weight.
 
     python benchmarks/answer.py [--sizes N ...] [--images P ...] [--stars K ...] [--wrong SHARE ...]
-        [--turns N] [--against FOLDER] [--output FILE.ecsv]
+        [--turns N] [--against FOLDER] [--cold] [--output FILE.ecsv]
 
 A scene has a jet of 1e5 electrons and K stars of 2e5, p lopsided Moffat PSFs of which each is wider
 than that before, and a background of 20. The PSFs given are wider by a share (by default 0 and 6
 %). The plain run has exact PSFs. Kernels are compiled before. Medians of so many turns; with
 --against another checkout takes turns with this one, each in a process of its own, and the last
-column is the time here over the time there.
+column is the time here over the time there. With --cold the columns are a first answer of a new
+process whose cache of kernels is empty, and the one after that.
 """
 
 import argparse
 import os
 import subprocess
 import sys
+import tempfile
 import time
 import warnings
 from itertools import product
@@ -72,15 +74,28 @@ def seconds(n, p, k, wrong, turns):
     return (*np.median(took, axis=0).tolist(), result.n_iter)
 
 
-def elsewhere(folder, arguments):
-    """Return what `seconds` is with the package of another checkout."""
-    done = subprocess.run(
-        [sys.executable, str(HERE), "--one", *map(str, arguments)],
-        env={**os.environ, "PYTHONPATH": str(folder)},
-        stdout=subprocess.PIPE,
-        text=True,
-        check=True,
-    )
+def cold_seconds(n, p, k, wrong):
+    """Return seconds of the first default answer of this process and the second; iterations."""
+    observation, stars = observe(n, p, k, wrong)
+    times = [time.perf_counter()]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", lnocl.LnoclWarning)
+        for _ in range(2):
+            result = lnocl.deconvolve(observation, stars)
+            times.append(time.perf_counter())
+    return (*np.diff(times).tolist(), result.n_iter)
+
+
+def elsewhere(folder, what, arguments):
+    """Return what a function is with the package of a checkout, and an empty cache of kernels."""
+    with tempfile.TemporaryDirectory() as cache:
+        done = subprocess.run(
+            [sys.executable, str(HERE), what, *map(str, arguments)],
+            env={**os.environ, "PYTHONPATH": str(folder), "POCL_CACHE_DIR": cache},
+            stdout=subprocess.PIPE,
+            text=True,
+            check=True,
+        )
     return tuple(map(float, done.stdout.split()))
 
 
@@ -89,22 +104,26 @@ def rows(given):
     own = HERE.parents[1]
     for each in product(given.sizes, given.images, given.stars, given.wrong):
         row = dict(zip(("size", "images", "stars", "wrong"), each, strict=True))
-        if not given.against:
-            default, plain, n_iter = seconds(*each, given.turns)
+        if not given.against and not given.cold:
+            found = np.array([seconds(*each, given.turns)])
         else:
+            call = ("--first", each) if given.cold else ("--one", (*each, 1))
+            sides = [own, given.against] if given.against else [own]
             turns = range(given.turns)
-            both = [[elsewhere(at, (*each, 1)) for at in (own, given.against)] for _ in turns]
-            (default, plain, n_iter), (before, *_) = np.median(both, axis=0)
-        row |= {"iterations": int(n_iter), "default": default, "plain": plain}
-        row["over plain"] = default / plain
-        yield row | ({"over before": default / before} if given.against else {})
+            found = np.median([[elsewhere(at, *call) for at in sides] for _ in turns], axis=0)
+        default, other, n_iter = found[0].tolist()
+        names = ("first", "second") if given.cold else ("default", "plain")
+        row |= {"iterations": int(n_iter), names[0]: default, names[1]: other}
+        row[f"over {names[1]}"] = default / other
+        yield row | ({"over before": default / found[1, 0]} if given.against else {})
 
 
 def main():
     """Measure."""
-    if sys.argv[1:2] == ["--one"]:
-        n, p, k, wrong, turns = sys.argv[2:]
-        print(*seconds(int(n), int(p), int(k), float(wrong), int(turns)))
+    if sys.argv[1:2] in (["--one"], ["--first"]):
+        n, p, k, wrong, *turns = map(float, sys.argv[2:])
+        of = seconds if turns else cold_seconds
+        print(*of(int(n), int(p), int(k), wrong, *map(int, turns)))
         return
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -115,6 +134,7 @@ def main():
     parser.add_argument("--wrong", type=float, nargs="+", default=[0.0, 0.06])
     parser.add_argument("--turns", type=int, default=3)
     parser.add_argument("--against", type=Path)
+    parser.add_argument("--cold", action="store_true")
     parser.add_argument("--output")
     given = parser.parse_args()
     report(rows(given), "answer", None, given.output)
