@@ -2,8 +2,8 @@
  * an edge, round the grid's own edges too, psi(t) = sqrt(t^2 + delta^2) - delta.
  */
 
-/* A point of slope or curvature, which only scenes that are smoothed have. What the penalty is, is no
- * constant: runs of one scene differ in it, and would each compile all kernels.
+/* A point of slope or curvature, which only scenes that are smoothed have. The penalty is an argument, no
+ * constant: the runs of one call differ in it, and each would compile all kernels.
  */
 INLINE cvec smoothing_at(__global const vec *smoothing, const int pixel, const int is_smoothed)
 {

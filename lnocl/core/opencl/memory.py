@@ -109,13 +109,7 @@ class Memory:
 
     def download_pixels(self, name: str) -> NDArray:
         """Return the one array of pixels that a buffer holds, in the precision of the device."""
-        pixels, offset = np.empty(self._layout.grid, self._layout.dtype), 0
-        for rows in self._layout.row_slices(len(pixels), MAX_COPIED):
-            packed = np.empty(pixels[rows].size, self._layout.dtype)
-            cl.enqueue_copy(self._queue, packed, self.buffers[name], src_offset=offset)
-            pixels[rows] = self._layout.unpack_pixels(packed)
-            offset += packed.nbytes
-        return pixels
+        return self._layout.unpack_pixels(self.download_raw(name))
 
     def download_raw(self, name: str) -> NDArray:
         """Return all of a buffer as it lies on the device."""

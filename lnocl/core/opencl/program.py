@@ -246,8 +246,9 @@ class _Built:
         PyOpenCL takes half a millisecond to make one.
         """
         self.used.add(name)
-        idle = self._idle[name]
-        return idle.pop() if idle else cl.Kernel(self.program, name)
+        with LOCK:
+            idle = self._idle[name]
+            return idle.pop() if idle else cl.Kernel(self.program, name)
 
     def take_back(self, kernels: Mapping[str, cl.Kernel]) -> None:
         """Have kernels that nothing launches any more for the next program."""
