@@ -98,6 +98,8 @@ class SourceError:
         precision of `forward` and `adjoint` too.
     width : float
         Pixels over which it is correlated (`lnocl.core.scene.smooth_field.SmoothField`).
+    unit : float, optional
+        Of the images that `adjoint` is given, lest single precision cannot hold them.
 
     Attributes
     ----------
@@ -113,8 +115,10 @@ class SourceError:
         adjoint: Callable[[Iterable[Array]], Array],
         amplitude: Array,
         width: float,
+        unit: float = 1.0,
     ) -> None:
-        self.images_of, self._adjoint, self._amplitude = forward, adjoint, amplitude
+        self.images_of, self._adjoint = forward, adjoint
+        self._amplitude, self._unit = amplitude, np.float64(unit)
         self._smooth = SmoothField(amplitude.shape, width, amplitude.dtype)
         self.at = np.zeros(amplitude.shape)
 
@@ -128,8 +132,8 @@ class SourceError:
 
     def adjoint(self, images: Sequence[Array]) -> Array:
         """Return the transpose of `forward` applied to images, shape (Ny, Nx)."""
-        rounded = (np.asarray(image, self._amplitude.dtype) for image in images)
-        return self._smooth.apply(self._amplitude * self._adjoint(rounded))
+        each = (np.asarray(image / self._unit, self._amplitude.dtype) for image in images)
+        return self._unit * self._smooth.apply(self._amplitude * self._adjoint(each))
 
 
 class LeastSquares:

@@ -120,7 +120,8 @@ def _source_error(model: Model, extended: Array) -> SourceError:
     # In single precision: conjugate gradients end long before its rounding.
     single, width = model.single(), CORRELATED * model.oversample
     amplitude = gaussian_filter(extended, SMOOTHED * model.oversample, mode="wrap")
-    return SourceError(single.forward, single.adjoint, amplitude.astype(np.float32), width)
+    amplitude = amplitude.astype(np.float32)
+    return SourceError(single.forward, single.adjoint, amplitude, width, model.scene.scale)
 
 
 def _linearise(
