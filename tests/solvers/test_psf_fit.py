@@ -178,6 +178,7 @@ def test_slopes_and_pixels_of_images_with_frames_and_psfs_of_their_own(known):
     ],
 )
 def test_the_step_is_that_of_the_whole_least_squares(known, moves, names, monkeypatch):
+    """Measured, the extended source in single precision: 8e-7, and 1.2e-7 of variances."""
     monkeypatch.setattr(psf_fit, "N_STEPS", 2000)
     monkeypatch.setattr(psf_fit, "FINISHED", 1e-13)
     monkeypatch.setattr(least_squares, "NEGLIGIBLE", 1e-12)
@@ -214,12 +215,12 @@ def test_the_step_is_that_of_the_whole_least_squares(known, moves, names, monkey
     wanted = np.concatenate([root[:, 0] * left, -np.sqrt(prior) * at, -x])
     expected = np.linalg.lstsq(matrix, wanted, rcond=None)[0]
     everything = np.concatenate([found, *(each.ravel() for each in of_fields)])
-    np.testing.assert_allclose(everything, expected, rtol=0, atol=1e-7 * abs(expected).max())
+    np.testing.assert_allclose(everything, expected, rtol=0, atol=2e-6 * abs(expected).max())
     covariance = np.linalg.inv(matrix.T @ matrix)
     monkeypatch.setattr(least_squares, "MISSING", 1e-12)
     unknowns = [0, len(at) - 1]
     expected = covariance[unknowns, unknowns]
-    np.testing.assert_allclose(fit.variances(unknowns), expected, rtol=1e-9)
+    np.testing.assert_allclose(fit.variances(unknowns), expected, rtol=3e-7)
 
 
 def test_pixels_change_the_images_as_another_psf_does():
