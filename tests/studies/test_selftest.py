@@ -35,11 +35,11 @@ FAULTS = {
 # section 7.4): 2.5 and 3 units in the last place.
 COARSE = {
     "g / modelled;": "coarse(g / modelled, 2.5);",
-    "a[q].re /= 1 + penalty_weight(mu, curved.re) * f.re * weight.re;": (
-        "a[q].re = coarse(a[q].re / (1 + penalty_weight(mu, curved.re) * f.re * weight.re), 2.5);"
+    "a[q].re /= 1 + (mu + curved.re) * f.re * weight.re;": (
+        "a[q].re = coarse(a[q].re / (1 + (mu + curved.re) * f.re * weight.re), 2.5);"
     ),
-    "a[q].im /= 1 + penalty_weight(mu, curved.im) * f.im * weight.im;": (
-        "a[q].im = coarse(a[q].im / (1 + penalty_weight(mu, curved.im) * f.im * weight.im), 2.5);"
+    "a[q].im /= 1 + (mu + curved.im) * f.im * weight.im;": (
+        "a[q].im = coarse(a[q].im / (1 + (mu + curved.im) * f.im * weight.im), 2.5);"
     ),
     "beta / sqrt(t * t + delta * delta);": (
         "coarse(beta / coarse(sqrt(t * t + delta * delta), 3), 2.5);"
@@ -47,8 +47,8 @@ COARSE = {
     "t * t / (sqrt(t * t + delta * delta) + delta);": (
         "coarse(t * t / (coarse(sqrt(t * t + delta * delta), 3) + delta), 2.5);"
     ),
-    "scaled / (1 + penalty_weight(mu, curvature) * scaled);": (
-        "coarse(scaled / (1 + penalty_weight(mu, curvature) * scaled), 2.5);"
+    "scaled / (1 + (mu + curvature) * scaled);": (
+        "coarse(scaled / (1 + (mu + curvature) * scaled), 2.5);"
     ),
     "(star.sum + star.lost) / star_weights[s];": (
         "(star.sum + star.lost) / star_weights[s] * (1 + 2.5f * 0x1p-23f);"
