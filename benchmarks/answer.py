@@ -87,7 +87,7 @@ def cold_seconds(n, p, k, wrong):
 
 
 def elsewhere(folder, what, arguments):
-    """Return what a function is with the package of a checkout, and an empty cache of kernels."""
+    """Return what this script prints with the package of a checkout and no compiled kernels."""
     with tempfile.TemporaryDirectory() as cache:
         done = subprocess.run(
             [sys.executable, str(HERE), what, *map(str, arguments)],

@@ -82,8 +82,9 @@ KERNEL void gradient_rows(
  * coupling_sums: <cross_information_s, d>; square_sums: sum f^2.
  * spectra: one array, out: twice the row spectrum. extended (f): one array of pixels, updated.
  * previous: one, written, or read. gradient, shift: one each, const; inverse_weight, curvature: as
- * for gradient_rows, which has D and change_sums. steps[GOING] 0: nothing. cross_information: [n_stars], a window of cross_blocks blocks and cross_columns
- * columns each; cross_corners: [n_stars][2]; cross_near: the stars of each block, see stars.cl.
+ * for gradient_rows, which has D and change_sums. steps[GOING] 0: nothing.
+ * cross_information: [n_stars], a window of cross_blocks blocks and cross_columns columns each;
+ * cross_corners: [n_stars][2]; cross_near: the stars of each block, see stars.cl.
  * coupling_sums: [n_stars][cross_blocks][2].
  * step_sums, square_sums: [ROW_BLOCKS][2].
  * Launch: up to ROW_BLOCKS groups. In place. Scratch: NX points. Twin: reference.step_rows.

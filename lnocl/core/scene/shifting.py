@@ -198,9 +198,13 @@ class MovablePsf:
         return _Spectrum(psf, variances)
 
 
-@remembered(2**24)  # scenes of one call have the same
 def movable_psf(psf: Array, grid: tuple[int, int]) -> MovablePsf:
-    """Return a `MovablePsf`."""
+    """Return a `MovablePsf`; a small one is kept, but a large one would take long to be told."""
+    return _kept_psf(psf, grid) if psf.nbytes <= 2**20 else MovablePsf(psf, grid)
+
+
+@remembered(2**24)  # scenes of one call have the same
+def _kept_psf(psf: Array, grid: tuple[int, int]) -> MovablePsf:
     return MovablePsf(psf.copy(), grid)
 
 
