@@ -1,11 +1,8 @@
 """Batches on a cluster of Dask that loses a worker and a connection, on the real engine."""
 
-import json
+import math
 import os
 import signal
-import threading
-import time
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,6 +11,7 @@ from astropy.table import Table
 from commandline import outcome
 from scenes import Recipe
 
+from lnocl import parallel
 from lnocl.commands import cli
 
 distributed = pytest.importorskip("distributed", reason="Dask is not installed")
@@ -42,31 +40,34 @@ def targets(tmp_path, monkeypatch):
     return [row[0].removesuffix(".fits") for row in rows]
 
 
-def disturb(client, lost):
-    """Kill two workers that have done something, and cut the connection a little later."""
-    for n_done in (N_TARGETS // 3, N_TARGETS // 2):
-        await_results(n_done)
-        lost.append(next(each for each in processes_of_results() if each not in lost))
-        os.kill(lost[-1], signal.SIGKILL)
-    await_results(N_TARGETS * 2 // 3)
-    client.loop.add_callback(client.scheduler_comm.comm.abort)
+class Disturbance:
+    """Kills two workers whose results have arrived, and cuts the connection a little later."""
+
+    def __init__(self, client):
+        self.client = client
+        self.processes, self.killed, self.is_cut = [], [], False
+
+    def pass_on(self, found, shown, passed_on=parallel._pass_on):
+        record = passed_on(found, shown)
+        if record.process:
+            self.processes.append(process_of(record.process))
+        n_done = len(self.processes)
+        alive = [each for each in self.processes if each not in self.killed]
+        if alive and n_done >= (N_TARGETS // 3, N_TARGETS // 2, math.inf)[len(self.killed)]:
+            self.killed.append(alive[0])
+            os.kill(alive[0], signal.SIGKILL)
+        if n_done >= N_TARGETS * 2 // 3 and not self.is_cut:
+            self.is_cut = True
+            self.client.loop.add_callback(self.client.scheduler_comm.comm.abort)
+        return record
 
 
-def processes_of_results():
-    """Return the processes that have done what is done, again and again until one is there."""
-    while True:
-        for record in Path("two").glob("*.json"):
-            if ":" in (process := json.loads(record.read_text()).get("process") or ""):
-                yield int(process.split(":")[1])
-        time.sleep(0.01)
+def process_of(text):
+    """Return the number of a process from the words host:process."""
+    return int(text.split(":")[1])
 
 
-def await_results(number):
-    while len(list(Path("two").glob("*.fits"))) < number:
-        time.sleep(0.01)
-
-
-def test_a_lost_worker_and_connection_change_no_result(targets, capfd):
+def test_a_lost_worker_and_connection_change_no_result(targets, capfd, monkeypatch):
     assert cli.main(["batch", "targets.csv", "-o", "one", "--quiet"]) == 1
     with (
         distributed.LocalCluster(
@@ -74,19 +75,19 @@ def test_a_lost_worker_and_connection_change_no_result(targets, capfd):
         ) as cluster,
         distributed.Client(cluster) as client,
     ):
-        lost = []
-        thread = threading.Thread(target=disturb, args=(client, lost))
-        thread.start()
+        disturbance = Disturbance(client)
+        monkeypatch.setattr(parallel, "_pass_on", disturbance.pass_on)
         words = ["batch", "targets.csv", "-o", "two", "--parallel", "current-scheduler"]
         assert cli.main(words) == 1
-        thread.join()
     assert f"{N_TARGETS} targets: {N_TARGETS - 1} done, 1 failed" in capfd.readouterr().out
     one, two = (Table.read(f"{folder}/summary.ecsv") for folder in ("one", "two"))
     for name in ("name", "status", "message", "n_iter", "stopped", "warnings", "device"):
         assert one[name].tolist() == two[name].tolist(), name
     assert one["status"].tolist() == ["failed" if k == 4 else "done" for k in range(N_TARGETS)]
-    processes = {int(each.split(":")[1]) for each in two["process"]}
-    assert processes & {*lost}  # what lost workers had done is not done again
-    assert processes - {*lost}
+    processes = {process_of(each) for each in two["process"]}
+    assert len(disturbance.killed) == 2
+    assert disturbance.is_cut
+    assert processes & {*disturbance.killed}  # what lost workers had done is not done again
+    assert processes - {*disturbance.killed}
     for name in set(targets) - {"gone"}:
         np.testing.assert_equal(outcome(f"one/{name}.fits"), outcome(f"two/{name}.fits"))
