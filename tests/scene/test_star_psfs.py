@@ -184,7 +184,8 @@ def test_a_psf_of_its_own_like_the_common_one_gives_the_flux_over_its_share():
     )
     factors = np.array([8.0, 8.0, 1.0, 1.0])
     np.testing.assert_allclose(own.star_fluxes, factors * common.star_fluxes, rtol=1e-4)
-    np.testing.assert_allclose(own.star_flux_errors, factors * common.star_flux_errors, rtol=1e-3)
+    # Those of own PSFs have what the extended source might take of the star: 0.002 in squares.
+    np.testing.assert_allclose(own.star_flux_errors, factors * common.star_flux_errors, rtol=2e-3)
     scale = common.extended.max()
     np.testing.assert_allclose(own.extended, common.extended, atol=1e-3 * scale)
     for found, expected in zip(own.star_residuals(), common.star_residuals(), strict=True):
@@ -265,7 +266,8 @@ def test_derivatives_by_the_place_of_the_star_are_those_of_differences():
         assert gradient[2 + k] == pytest.approx((ends[0] - ends[1]) / 2e-4, rel=1e-4)
 
 
-def test_a_planet_in_the_halo_of_the_star_has_its_flux_within_errors():
+def test_a_planet_in_the_halo_of_the_star_and_the_star_have_fluxes_within_errors():
+    """Noise makes light beside a wide PSF that it lacks itself: 4 %, where errors were 1 %."""
     rng, y, x = np.random.default_rng(8), *np.indices((N, N))
     star, planet = (18.3, 20.6), (25.2, 15.9)
 
@@ -281,9 +283,10 @@ def test_a_planet_in_the_halo_of_the_star_has_its_flux_within_errors():
         rng.poisson(light + 20.0), blob(u, v, 1.5), background=20.0,
         star_psfs=behind(u, v), star_places=star,
     )  # fmt: skip
-    result = lnocl.deconvolve(obs, [star, planet], n_iter=20, engine="numpy")
+    result = lnocl.deconvolve(obs, [star, planet], engine="numpy")
     pulls = (result.star_fluxes - [4e6, 4e3]) / result.star_flux_errors
-    assert (abs(pulls) < 3).all(), pulls
+    assert (abs(pulls) < 2).all(), pulls
+    assert (result.star_flux_errors < [0.1 * 4e6, 0.1 * 4e3]).all()
     assert result.verdict() == ["the model fits"]
 
 
