@@ -124,10 +124,10 @@ class TestHalves:
         assert min(first.images.min(), second.images.min()) >= 0
         np.testing.assert_array_equal(first.background, observation.background / 2)
 
-    @pytest.mark.parametrize("fraction", [0.0, 0.3])
-    def test_are_independent_poisson_counts(self, fraction):
-        """Variance and covariance of a million pixels, six standard errors wide."""
-        n, mean = 1000, 20.0
+    @pytest.mark.parametrize(("mean", "fraction"), [(20.0, 0.0), (20.0, 0.3), (64.0, 0.0)])
+    def test_are_independent_poisson_counts(self, mean, fraction):
+        """Mean, variance and covariance of a million pixels, six standard errors wide."""
+        n = 1000
         images = np.random.default_rng(5).poisson(mean, (n, n)) + fraction
         first, second = split_counts(lnocl.Observation(images, np.ones((1, 1))))
         covariance = np.cov(first.images.ravel(), second.images.ravel())
@@ -135,7 +135,26 @@ class TestHalves:
         # Of a fraction, which is no count, 1/4 of its square goes to each.
         shift = fraction**2 / 4.0
         np.testing.assert_allclose(np.diag(covariance), mean / 2.0 + shift, atol=allowed)
+        assert abs((first.images - second.images).mean()) < 6.0 * np.sqrt(mean) / n
         assert abs(covariance[0, 1] + shift) < allowed
+
+    @pytest.mark.parametrize("value", [1, 63, 64, 65, 1000])
+    def test_of_one_count_are_binomial(self, value):
+        """Chi square of a thousand pixels in bins of five or more, at 1e-4."""
+        first, _ = split_counts(lnocl.Observation(np.full((40, 25), value), np.ones((1, 1))))
+        edges = np.unique(scipy.stats.binom.ppf(np.linspace(0.01, 0.99, 20), value, 0.5))[:-1]
+        at = np.searchsorted(edges, first.images.ravel())
+        expected = 1000.0 * np.diff([0.0, *scipy.stats.binom.cdf(edges, value, 0.5), 1.0])
+        assert (
+            scipy.stats.chisquare(np.bincount(at, minlength=len(expected)), expected).pvalue > 1e-4
+        )
+
+    def test_of_an_image_depend_on_no_other(self):
+        images = np.random.default_rng(1).poisson(30.0, (3, 800, 800))
+        both = [
+            split_counts(lnocl.Observation(each, np.ones((1, 1)))) for each in (images, images[:2])
+        ]
+        np.testing.assert_array_equal(both[0][0].images[:2], both[1][0].images)
 
     def test_leave_masked_pixels_out(self):
         observation, *_ = scene(mask=True)

@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
+
 import numpy as np
 
+from lnocl.core.scene.arrays import Array
 from lnocl.core.scene.observation import Observation
 from lnocl.errors import InputError
 
 # Binomial samples are drawn as 64-bit integers.
 MAX_COUNTS = 2.0**62
+# With the index of an image.
 SEED = 0
+# Of so many counts each is dealt out by a random bit.
+BITS = 64
 
 
 def split_counts(observation: Observation) -> tuple[Observation, Observation]:
@@ -32,14 +38,24 @@ def split_counts(observation: Observation) -> tuple[Observation, Observation]:
             f"a pixel of {images.max():.3g} electrons is too bright to be split; give `n_iter` and "
             "`stop` None"
         )
-    rng = np.random.default_rng(SEED)
-    first = np.empty_like(images)
-    for image, half in zip(images, first, strict=True):
-        whole = np.floor(image)
-        half[:] = rng.binomial(whole.astype(np.int64), 0.5)
-        half += (image - whole) * rng.integers(0, 2, image.shape)
+    with ThreadPoolExecutor() as threads:
+        first = np.array([*threads.map(_half, enumerate(images))])
     background = observation.background / 2.0
     return (
         observation.replace(images=first, background=background),
         observation.replace(images=images - first, background=background),
     )
+
+
+def _half(indexed: tuple[int, Array]) -> Array:
+    """Return half the counts of an image, given with its index, which no other image changes."""
+    j, image = indexed
+    rng = np.random.default_rng((SEED, j))
+    whole = np.floor(image)
+    counts = whole.astype(np.uint64)
+    bits = rng.integers(2**BITS, size=image.shape, dtype=np.uint64)
+    half = np.bitwise_count(bits >> (BITS - np.minimum(counts, BITS))).astype(np.float64)
+    many = counts > BITS
+    half[many] = rng.binomial(whole[many].astype(np.int64), 0.5)
+    half += (image - whole) * rng.integers(0, 2, image.shape)
+    return half
