@@ -6,7 +6,7 @@ from dataclasses import fields
 from kernel_cases import FOLDER, agree_with_twins
 
 from lnocl.core.reference import decide
-from lnocl.core.scene import steps
+from lnocl.core.scene import band_matrix, steps
 
 test_kernels_agree_with_their_twins = agree_with_twins("decide.cl")
 
@@ -27,6 +27,6 @@ def test_reasons_and_constants_are_those_of_the_kernels():
     shortest, longest = decide.ALPHA_BOUNDS
     own = {"SHORTEST": shortest, "LONGEST": longest}
     assert {name: float(value) for name, value in defined.items()} == {
-        name: own.get(name) or getattr(decide, name) for name in defined
+        name: own.get(name) or (vars(band_matrix) | vars(decide))[name] for name in defined
     }
     assert len(defined) == 9

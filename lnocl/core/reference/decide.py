@@ -8,6 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from lnocl.core.scene.arrays import Array
+from lnocl.core.scene.band_matrix import bounded_step
 from lnocl.core.scene.steps import CHANGE_WINDOW, NOT_FINITE, PAUSED, SETTLED, STUCK, Steps
 
 # Bonettini, Zanella & Zanni (2009), Inverse Problems 25, 015002: the line search shortens a step by
@@ -18,11 +19,6 @@ SUFFICIENT = 1e-4
 ALPHA_BOUNDS = 1e-5, 1e5
 # A step that was shortened so often is lost in rounding.
 MAX_SHORTENINGS = 12
-# A star's flux falls by this share at most in one step, so that it never reaches 0 by a step that
-# was too long; rounds in which steps are brought there, and what is as good as there.
-MOST_FADING = 0.9
-N_ROUNDS = 64
-NEARLY = 1e-3
 
 
 def next_step(steps: Steps, change_step: float, change_change: float) -> tuple[float, float]:
@@ -37,27 +33,6 @@ def next_step(steps: Steps, change_step: float, change_change: float) -> tuple[f
     length = change_step / change_change if is_convex else 10.0 * steps.alpha
     length = float(np.clip(length, *ALPHA_BOUNDS))
     return min(steps.length, length), length
-
-
-def bounded_step(star_inverse: Array, force: Array, fluxes: Array) -> Array:
-    """Return the change of fluxes by Newton's method, none falling by more than nine tenths.
-
-    It minimises ``<force, change> + <change, F change> / 2`` within those bounds, by the method of
-    Hildreth (1957, Naval Research Logistics Quarterly 4, 79) from ``-F^-1 force``: a flux that is
-    below its bound is pushed there, and pushes the others.
-    """
-    least = -MOST_FADING * fluxes
-    # Without BLAS, whose rounding depends on the number of threads.
-    change, pushes = -(star_inverse * force).sum(axis=1), np.zeros(len(fluxes))
-    for _ in range(N_ROUNDS):
-        if not (change < least - NEARLY * fluxes).any():
-            break
-        for t, variances in enumerate(star_inverse):
-            if variances[t] > 0:
-                lift = max((least[t] - change[t]) / variances[t], -pushes[t])
-                change += lift * variances
-                pushes[t] += lift
-    return np.where(pushes > 0, least, np.maximum(change, least))  # without rounding
 
 
 def follow_stars(

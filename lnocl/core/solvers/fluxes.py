@@ -10,14 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lnocl.core.scene.arrays import Array
-from lnocl.core.scene.band_matrix import BandMatrix
+from lnocl.core.scene.band_matrix import MOST_FADING, BandMatrix, bounded_step
 from lnocl.core.scene.forward_model import Model
 from lnocl.core.scene.scene import MIN_MODEL, Scene
 from lnocl.core.scene.stars import Pixels, StarImages
 
-# A star's flux falls to this share at most in one step, so that it never reaches 0 by a step that
-# was too long.
-MAX_FADING = 0.1
+# A star's flux falls to this share at most in one step.
+MAX_FADING = 1.0 - MOST_FADING
 # The fit of the fluxes ends where they change by less of their standard error.
 FIT_CHANGE = 1e-6
 FIT_ROUNDS = 50
@@ -145,7 +144,7 @@ def fit_fluxes(scene: Scene, model: Model, diffuse: Array, fluxes: Array) -> Arr
         models = likelihood.models([each.light(fluxes) for each in stars])
         if differ(models, used):
             information, used = likelihood.information(stars, models), models
-        step = bounded_step(information, likelihood.gradient(stars, models)[0], fluxes)
+        step = best_step(information, likelihood.gradient(stars, models)[0], fluxes)
         fluxes = fluxes + step
         if (abs(step) * np.sqrt(information.diagonal) <= FIT_CHANGE).all():
             break
@@ -174,30 +173,12 @@ def variances(information: Array) -> Array:
     return np.where(is_known, np.where(is_blended, np.nan, sums / roots**2), np.inf)
 
 
-def bounded_step(information: BandMatrix, gradient: Array, fluxes: Array) -> Array:
+def best_step(information: BandMatrix, gradient: Array, fluxes: Array) -> Array:
     """Return the change of the fluxes by Newton's method, none falling by more than nine tenths.
 
-    Where one would, the others are those that are best with it held there: the step minimises
-    ``<gradient, step> + <step, F step> / 2`` within those bounds, so that it never leads uphill.
+    Where one would, it is that of `lnocl.core.scene.band_matrix.bounded_step`, as in iterations.
     """
-    least = (MAX_FADING - 1.0) * fluxes
-    free = step = -information.solve(gradient)
-    held = np.zeros(len(fluxes), bool)
-    while (too_low := (step < least) & ~held).any():
-        import scipy.optimize  # it takes half a second, and few fits need it
-
-        held |= too_low
-        at = np.flatnonzero(held)
-        # The forces that hold them there push, and never pull.
-        pushes = np.zeros((len(fluxes), len(at)))
-        pushes[at, np.arange(len(at))] = np.sqrt(information.diagonal[at])
-        moved = information.solve(pushes)
-        values, vectors = np.linalg.eigh(pushes[at].diagonal()[:, None] * moved[at])
-        determined = values > values.max() * len(at) * np.finfo(np.float64).eps
-        root = np.sqrt(values[determined])
-        lifted = vectors[:, determined].T @ (pushes[at].diagonal() * (least - free)[at]) / root
-        forces = scipy.optimize.nnls(root[:, None] * vectors[:, determined].T, lifted)[0]
-        step = free + moved @ forces
-        bound = at[forces > 0]
-        step[bound] = least[bound]  # without rounding, which fluxes near 0 have to fall below
-    return np.maximum(step, least)
+    step = -information.solve(gradient)
+    if (step >= -MOST_FADING * fluxes).all():
+        return step
+    return bounded_step(information.solve(np.eye(len(fluxes))), gradient, fluxes)

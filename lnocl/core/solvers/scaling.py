@@ -17,7 +17,7 @@ from lnocl.core.scene.forward_model import Box, Model, largest_window
 from lnocl.core.scene.scene import MIN_MODEL, Scene
 from lnocl.core.scene.shifting import Cutout
 from lnocl.core.scene.star_prior import StarPrior
-from lnocl.core.solvers.fluxes import bounded_step, fit_fluxes, movable_weights
+from lnocl.core.solvers.fluxes import best_step, fit_fluxes, movable_weights
 
 # Share of the light of stars and background that shifts the scaling. With all of it the
 # empty sky takes up noise from the first steps on, without any it is stuck where it is 0: measured
@@ -153,7 +153,7 @@ def heed(prior: StarPrior | None, star_fluxes: Array, scaling: Scaling) -> tuple
     if prior is None:
         return star_fluxes, scaling
     scaling = scaling.with_prior(prior)
-    change = bounded_step(scaling.star_information, prior.gradient(star_fluxes), star_fluxes)
+    change = best_step(scaling.star_information, prior.gradient(star_fluxes), star_fluxes)
     return star_fluxes + change, scaling
 
 
