@@ -11,6 +11,7 @@ from scipy.special import log_ndtr
 
 from lnocl.core.scene.arrays import Array, Mask
 from lnocl.core.scene.remembered import remembered
+from lnocl.core.scene.transforms import enlarged
 
 # Rings begin at this share of the way to the nearest edge: the light beyond is told from rings far
 # out, its slope from rings that lie apart. So many rings at most, a pixel wide at least.
@@ -91,7 +92,7 @@ class PsfEdge(NamedTuple):
         ndarray of float64, shape (ny, nx)
             0 within the file; its sum tends to `light` as the shape grows.
         """
-        outside = ~_placed(self.known, shape)
+        outside = ~enlarged(self.known, shape, is_centred=True)
         wing = np.zeros(shape)
         r = _radii(shape)[outside]
         squares = (r**2 + self.core**2) / (self.radius**2 + self.core**2)
@@ -154,19 +155,6 @@ def _radii(shape: tuple[int, ...]) -> Array:
     return np.hypot(y[:, None], x)
 
 
-def _placed(known: Mask, shape: tuple[int, ...]) -> Mask:
-    """Return a mask in an array of another shape, middle on middle."""
-    placed = np.zeros(shape, bool)
-    theirs, own = [], []
-    for size, other in zip(known.shape, shape, strict=True):
-        first = other // 2 - size // 2
-        low, high = max(first, 0), min(first + size, other)
-        theirs.append(slice(low, high))
-        own.append(slice(low - first, high - first))
-    placed[tuple(theirs)] = known[tuple(own)]
-    return placed
-
-
 def _known(psf: Array) -> Mask:
     """Return the pixels that are not of a region of zeros along the edges.
 
@@ -181,7 +169,7 @@ def _known(psf: Array) -> Mask:
 def _reach(known: Mask) -> float:
     """Return the radius of the largest circle round the middle that is known."""
     shape = tuple(n + 2 for n in known.shape)
-    return float(_radii(shape)[~_placed(known, shape)].min()) - 0.5
+    return float(_radii(shape)[~enlarged(known, (shape[0], shape[1]), is_centred=True)].min()) - 0.5
 
 
 class _Forms:
@@ -217,7 +205,7 @@ class _Forms:
         """Return the light in all pixels that are not known, of each form and of a halo."""
         half = int(np.ceil(self.furthest))
         r = _radii((2 * half + 1, 2 * half + 1))
-        missing = r[~_placed(known, r.shape) & (r <= self.furthest)]
+        missing = r[~enlarged(known, r.shape, is_centred=True) & (r <= self.furthest)]
         near = self.table @ np.bincount(self.steps(missing), minlength=STEPS + 1)
         ratio = self._over_edge(self.furthest)[:, 0]
         squares = self.furthest**2 + self.core**2
