@@ -8,7 +8,7 @@ smoothing, which is made anew with the PSFs of theta, and theta then found again
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from contextlib import suppress
 from dataclasses import replace
 
@@ -155,5 +155,5 @@ class _OfWindow:
         images[self._there] = seen
         return images
 
-    def adjoint(self, images: Sequence[Array]) -> Array:
+    def adjoint(self, images: Array) -> Array:
         return self._field.adjoint(images[self._there])

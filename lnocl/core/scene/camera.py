@@ -359,6 +359,8 @@ class TurnedWindow(LinearMap):
 
     def seen(self, spectrum: Spectrum) -> Array:
         """Return the image of the sky that has this spectrum."""
+        if spectrum.ndim > 2:
+            return np.array([self.seen(each) for each in spectrum])
         row_spectra = scipy.fft.ifft(self._otf * spectrum, axis=0)
         sheared = scipy.fft.irfft(row_spectra * self._phases, self._grid[1], axis=1)
         taken = self._rotation.sampled(sheared)
@@ -399,12 +401,12 @@ class Windows:
         self._joint = [_joined([maps[j] for j in members]) for members in self._cuts]
 
     def forward(self, sky: Array) -> list[Array]:
-        """Return the images of a sky."""
+        """Return the images of a sky, or of several, shape (..., ny, nx)."""
         images, spectra = [sky] * len(self._maps), dict[Hashable, Spectrum]()
         for members, each in zip(self._cuts, self._joint, strict=True):
-            seen = each.seen(each.shared_spectrum(sky, spectra))
-            for j, image in zip(members, seen if len(members) > 1 else [seen], strict=True):
-                images[j] = image
+            seen = each.seen(each.shared_spectrum(sky, spectra)[..., None, :, :])
+            for k, j in enumerate(members):
+                images[j] = seen[..., k, :, :]
         return images
 
     def adjoint(self, images: Sequence[Array]) -> Array:

@@ -32,7 +32,7 @@ from lnocl.core.scene.estimate import Estimate
 from lnocl.core.scene.psfs import PSF_ERROR
 from lnocl.core.scene.texture import Texture
 from lnocl.core.solvers.fluxes import variances
-from lnocl.core.solvers.least_squares import ROUNDING, LinearImage
+from lnocl.core.solvers.least_squares import LeastSquares, LinearImage
 from lnocl.core.solvers.near_star import NearStar, Surroundings, brightest, offsets_from
 from lnocl.core.solvers.psf_errors import CORRELATED, NARROWEST
 
@@ -44,6 +44,8 @@ NEAREST, FARTHEST, STEPS = 0.5, 3.0, 2.0
 # Standard errors that a point has where it is tried, and beside what the extended source may be
 # there, as of detections; each of its steps is so many pixels at most.
 SIGNIFICANT, CLEAR, MOVED, N_STEPS = 5.0, 3.0, 1.0, 2
+# So many are tried at once, as each has images.
+AT_ONCE = 64
 # The share of the gradient at which conjugate gradients end, and the information of what is free.
 FINISHED, FREE = 1e-2, 1e-9
 
@@ -194,31 +196,27 @@ def _points(
     if near.psfs is not None:
         scatters = near.psfs.pixels(near.window.shape).scatter
     extended = near.source.images_of(near.expected + estimate.part(near.places(estimate.scene)))
-    information, n = near.prior.copy(), len(near.prior)
-    information[near.level, near.level] = FREE
-    moments, images = np.zeros(n), list[LinearImage]()
+    prior, images = near.prior.copy(), list[LinearImage]()
+    prior[near.level, near.level] = FREE
     for image, light, scatter in zip(near.images, extended, scatters, strict=True):
         noise = 1.0 + image.precision * (2.0 * np.pi * (CORRELATED * scatter) ** 2)
-        weights, left = image.precision / noise, image.left + light
-        weighted = image.slopes * weights.ravel()
-        information[np.ix_(image.unknowns, image.unknowns)] += weighted @ image.slopes.T
-        moments[image.unknowns] += weighted @ left.ravel()
-        images.append(image._replace(slopes=weighted, left=weights * left, precision=weights))
-    known = np.diag(information)  # 0 of what no image shows
-    units = np.divide(1.0, np.sqrt(known), out=np.zeros(n), where=known > 0)
-    scaled = information * units * units[:, None] + ROUNDING * np.eye(n)
-    inverse = np.linalg.inv(scaled) * units * units[:, None]
+        images.append(image._replace(left=image.left + light, precision=image.precision / noise))
+    beside = LeastSquares(images, [], prior, 0, 0.0)
+    now = beside.invert(beside.moments(np.array([each.left for each in images])))
     fluxes, errors = np.zeros((2, len(at[0])))
-    for k, (y, x) in enumerate(zip(*at, strict=True)):
-        point, shares, told, score = np.zeros(near.expected.shape), np.zeros(n), 0.0, 0.0
-        point[y, x] = 1.0
-        for image, seen in zip(images, near.source.images_of(point), strict=True):
-            shares[image.unknowns] += image.slopes @ seen.ravel()
-            told += float(np.vdot(image.precision, seen**2))
-            score += float(np.vdot(image.left, seen))
-        of_unknowns = inverse @ shares
-        told = max(told - float(shares @ of_unknowns), FREE)
-        fluxes[k], errors[k] = (score - of_unknowns @ moments) / told, told**-0.5
+    for first in range(0, len(at[0]), AT_ONCE):
+        few = slice(first, first + AT_ONCE)
+        y, x = (each[few] for each in at)
+        points = np.zeros((len(y), *near.expected.shape))
+        points[np.arange(len(y)), y, x] = 1.0
+        shares, (told, score) = np.zeros((len(prior), len(y))), np.zeros((2, len(y)))
+        for image, seen in zip(images, near.source.images_of(points), strict=True):
+            weighted = (seen * image.precision).reshape(len(y), -1)
+            shares[image.unknowns] += image.slopes @ weighted.T
+            told += (weighted * seen.reshape(len(y), -1)).sum(axis=1)
+            score += weighted @ image.left.ravel()
+        told = np.maximum(told - (shares * beside.invert(shares)).sum(axis=0), FREE)
+        fluxes[few], errors[few] = (score - now @ shares) / told, told**-0.5
     return fluxes, errors
 
 

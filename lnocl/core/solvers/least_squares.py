@@ -21,7 +21,6 @@ from collections.abc import Callable, Iterable, Sequence
 from typing import NamedTuple, Protocol
 
 import numpy as np
-import scipy.linalg
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
@@ -32,8 +31,8 @@ from lnocl.core.scene.smooth_field import SmoothField
 MISSING, NEGLIGIBLE = 1e-4, 1e-4
 # Derivatives of which a smaller share is not 0 are held as a sparse array.
 SPARSE = 0.25
-# Added to the diagonal of the information, which is scaled to 1 before.
-ROUNDING = 1e-12
+# Added to the diagonal of the information, which is scaled to 1 before, where it is not less.
+ROUNDING, LEAST = 1e-12, 1e-290
 
 
 class LinearImage(NamedTuple):
@@ -78,7 +77,7 @@ class Field(Protocol):
     def forward(self, x: Array) -> Iterable[Array]:
         """Return the changes of the images, shape (p, Ny, Nx)."""
 
-    def adjoint(self, images: Sequence[Array]) -> Array:
+    def adjoint(self, images: Array) -> Array:
         """Return the transpose of `forward` applied to images, in the shape of x."""
 
 
@@ -130,10 +129,10 @@ class SourceError:
         """Return the change of the extended source, ``a C^(1/2) x``, shape (Ny, Nx)."""
         return np.asarray(self._amplitude * self._smooth.apply(x))
 
-    def adjoint(self, images: Sequence[Array]) -> Array:
+    def adjoint(self, images: Array) -> Array:
         """Return the transpose of `forward` applied to images, shape (Ny, Nx)."""
-        each = (np.asarray(image / self._unit, self._amplitude.dtype) for image in images)
-        return self._unit * self._smooth.apply(self._amplitude * self._adjoint(each))
+        scaled = np.asarray(images / self._unit, self._amplitude.dtype)
+        return self._unit * self._smooth.apply(self._amplitude * self._adjoint(scaled))
 
 
 class LeastSquares:
@@ -168,6 +167,8 @@ class LeastSquares:
         finished: float,
     ) -> None:
         self._images = [each._replace(slopes=_sparse(each.slopes)) for each in images]
+        self._left = np.array([each.left for each in images])
+        self._precision = np.array([each.precision for each in images])
         self._fields = fields
         self._prior = prior = np.diag(prior) if prior.ndim == 1 else prior
         self._n_steps, self._finished = n_steps, finished
@@ -176,10 +177,11 @@ class LeastSquares:
         for each in self._images:
             block = _product(each.slopes * each.precision.reshape(1, -1), each.slopes.T)
             information[np.ix_(each.unknowns, each.unknowns)] += block
-        self._units = 1.0 / np.sqrt(np.maximum(np.diag(information), np.finfo(float).tiny))
-        scaled = information * self._units * self._units[:, None]
+        units = 1.0 / np.sqrt(np.maximum(np.diag(information), LEAST))
+        scaled = information * units * units[:, None]
         # Stars that nothing tells apart leave it singular.
-        self._factor = scipy.linalg.cho_factor(scaled + ROUNDING * np.eye(len(prior)))
+        inverse = np.linalg.inv(scaled + ROUNDING * np.eye(len(prior)))
+        self._inverse = (inverse + inverse.T) / 2.0 * units * units[:, None]
 
     def solve(self, at: Array | None = None) -> tuple[Array, list[Array]]:
         """Return the changes of the parameters and of the fields that minimise the sum.
@@ -212,7 +214,7 @@ class LeastSquares:
         """
         if not len(unknowns):
             return np.zeros(0)
-        columns = [self._invert(unit) for unit in np.eye(len(self._prior))[unknowns]]
+        columns = [self.invert(unit) for unit in np.eye(len(self._prior))[unknowns]]
         found = np.array([column[i] for column, i in zip(columns, unknowns, strict=True)])
         rests = np.array([self._adjoint(self._changes(column)) for column in columns])
         least = self._finished**2 * _sum("ik,ik->i", rests, rests)
@@ -230,26 +232,23 @@ class LeastSquares:
 
     def row(self, unknown: int) -> tuple[float, Array]:
         """Return the variance of one parameter, and its change by each residual, (p, Ny, Nx)."""
-        direct = self._invert(np.eye(len(self._prior))[unknown])
+        direct = self.invert(np.eye(len(self._prior))[unknown])
         seen = self._changes(direct)
         wanted = self._adjoint(seen)
         x = self._find_fields(wanted)
         of_fields = self._forward(x)
-        seen += self._changes(self._invert(self._moments(of_fields))) - of_fields
-        for image, each in zip(seen, self._images, strict=True):
-            image *= each.precision
-        return float(direct[unknown] + _sum("i,i", wanted, x)), seen
+        seen += self._changes(self.invert(self.moments(of_fields))) - of_fields
+        return float(direct[unknown] + _sum("i,i", wanted, x)), self._precision * seen
 
     def _solve(self, pull: Array) -> tuple[Array, Array]:
         """Return the changes of the parameters, shape (k,), and of the fields, one after the other.
 
         `pull` is half the gradient of the prior of the parameters, shape (k,).
         """
-        left = np.array([each.left for each in self._images])
-        direct = self._invert(self._moments(left) - pull)
+        direct = self.invert(self.moments(self._left) - pull)
         at = np.concatenate([field.at.ravel() for field in self._fields])
-        x = self._find_fields(self._adjoint(left - self._changes(direct)) - at)
-        return self._invert(self._moments(left - self._forward(x)) - pull), x
+        x = self._find_fields(self._adjoint(self._left - self._changes(direct)) - at)
+        return self.invert(self.moments(self._left - self._forward(x)) - pull), x
 
     def _find_fields(self, wanted: Array) -> Array:
         """Return x with ``S x = wanted``.
@@ -282,7 +281,7 @@ class LeastSquares:
         S is the Schur complement of the block of the parameters.
         """
         images = self._forward(x)
-        images -= self._changes(self._invert(self._moments(images)))
+        images -= self._changes(self.invert(self.moments(images)))
         return x + self._adjoint(images)
 
     def _each(self, x: Array) -> list[Array]:
@@ -292,35 +291,32 @@ class LeastSquares:
 
     def _forward(self, x: Array) -> Array:
         """Return the changes of the images by the fields, shape (p, Ny, Nx)."""
-        images = np.zeros((len(self._images), *self._images[0].left.shape))
-        for field, part in zip(self._fields, self._each(x), strict=True):
-            for image, change in zip(images, field.forward(part), strict=True):
-                image += change
-        return images
+        changes = zip(self._fields, self._each(x), strict=True)
+        return np.sum([[*field.forward(part)] for field, part in changes], axis=0)
 
     def _adjoint(self, images: Array) -> Array:
         """Return ``sum_j B_j^T P_j y_j`` of images y, the fields one after the other."""
-        weighted = [each.precision * x for each, x in zip(self._images, images, strict=True)]
+        weighted = self._precision * images
         return np.concatenate([field.adjoint(weighted).ravel() for field in self._fields])
 
-    def _moments(self, images: Array) -> Array:
+    def moments(self, images: Array) -> Array:
         """Return ``sum_j J_j^T P_j y_j`` of images y, shape (k,)."""
         moments = np.zeros(len(self._prior))
-        for each, image in zip(self._images, images, strict=True):
-            moments[each.unknowns] += _product(each.slopes, (each.precision * image).ravel())
+        for each, image in zip(self._images, self._precision * images, strict=True):
+            moments[each.unknowns] += _product(each.slopes, image.ravel())
         return moments
 
     def _changes(self, change: Array) -> Array:
         """Return the changes of the models, shape (p, Ny, Nx), where the unknowns change."""
-        images = np.zeros((len(self._images), *self._images[0].left.shape))
+        images = np.zeros_like(self._left)
         for image, each in zip(images, self._images, strict=True):
             if (own := change[each.unknowns]).any():
                 image[:] = _product(each.slopes.T, own).reshape(image.shape)
         return images
 
-    def _invert(self, moments: Array) -> Array:
-        """Return the inverse of `information` applied to a vector, shape (k,)."""
-        return np.asarray(self._units * scipy.linalg.cho_solve(self._factor, self._units * moments))
+    def invert(self, moments: Array) -> Array:
+        """Return the inverse of `information` applied to a vector (k,), or columns (k, n)."""
+        return _product(self._inverse, moments)
 
 
 def _sparse(slopes: Array) -> Array | csr_array:

@@ -324,9 +324,9 @@ class PixelErrors:
         changes = self.scatter * self._smooth.apply(x)[self._numbers]
         return changes - self._shares * changes.sum(axis=(1, 2), keepdims=True)
 
-    def adjoint(self, images: Sequence[Array]) -> Array:
+    def adjoint(self, images: Array) -> Array:
         """Return the transpose of `forward` applied to images, shape (n_psfs, height, width)."""
-        back, seen = np.zeros_like(self.at), np.asarray(images)
-        lost = (self._shares * seen).sum(axis=(1, 2), keepdims=True)
-        np.add.at(back, self._numbers, self.scatter * (seen - lost))
+        back = np.zeros_like(self.at)
+        lost = (self._shares * images).sum(axis=(1, 2), keepdims=True)
+        np.add.at(back, self._numbers, self.scatter * (images - lost))
         return self._smooth.apply(back)

@@ -197,7 +197,7 @@ class _PixelErrors:
             seen = scipy.fft.irfft2(change * sky, self._grid, workers=threads(self._grid))
             yield sampled(seen, self._oversample)
 
-    def adjoint(self, images: Sequence[Array]) -> Array:
+    def adjoint(self, images: Array) -> Array:
         fields, workers = np.empty_like(self.at), threads(self._grid)
         for j, (image, sky) in enumerate(zip(images, self._skies, strict=True)):
             of_image = scipy.fft.rfft2(spread(image, self._oversample), workers=workers)
