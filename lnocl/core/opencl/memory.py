@@ -131,7 +131,7 @@ class Memory:
         dtype = self._layout.dtype
         with np.errstate(over="ignore"):
             rounded = np.asarray(values).astype(dtype)
-        if not np.isfinite(rounded).all():
+        if rounded.size and not np.isfinite((rounded.min(), rounded.max())).all():
             raise InputError(
                 f"{name.replace('_', ' ')} as large as {np.abs(values).max() * self._scale:g} "
                 f"cannot be held in {dtype}: scale the scene, or take `precision` double"

@@ -17,6 +17,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from lnocl.core.runs.halves import Snapshot
 from lnocl.core.scene.arrays import Array
@@ -69,7 +70,7 @@ def assess(
     """
     inside = tuple(map(slice, shape))
 
-    def product(a: Array, b: Array) -> float:
+    def product(a: NDArray[np.floating], b: NDArray[np.floating]) -> float:
         return float(np.einsum("yx,yx->y", a[inside], b[inside]).sum(dtype=np.float64))
 
     a_last, b_last = reference.extended

@@ -29,7 +29,7 @@ class Snapshot(NamedTuple):
     ----------
     iteration : int
         The iteration.
-    extended : ndarray, shape (2, Ny, Nx)
+    extended : sequence of two ndarray, shape (Ny, Nx)
         A and B, the extended sources.
     star_fluxes : ndarray of float64, shape (2, n)
         Star fluxes.
@@ -38,7 +38,7 @@ class Snapshot(NamedTuple):
     """
 
     iteration: int
-    extended: Array
+    extended: Sequence[NDArray[np.floating]]
     star_fluxes: Array
     positions: Array
 
@@ -122,7 +122,7 @@ class Halves:
         """Return the estimates as they are."""
         return Snapshot(
             self.done,
-            np.array([run.engine.extended() for run in self._runs]),
+            [run.engine.extended() for run in self._runs],
             np.array([run.engine.star_fluxes() for run in self._runs]),
             np.array([run.scene.stars for run in self._runs]),
         )

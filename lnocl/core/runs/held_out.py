@@ -230,7 +230,7 @@ class HeldOutCounts:
         scene = start.scene.penalised(penalty)
         if start.refines:
             scene.move_stars(snapshot.positions.mean(axis=0))
-        extended = snapshot.extended.mean(axis=0, dtype=np.float64)
+        extended = np.asarray(np.mean(snapshot.extended, axis=0, dtype=np.float64))
         return Outcome(
             setup=start.setup,
             estimate=Estimate.of_scaled(scene, extended, snapshot.star_fluxes.mean(axis=0)),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import astuple, dataclass
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -69,7 +69,7 @@ class Steps:
 
     def numbers(self) -> Array:
         """Return all of them."""
-        return np.array(astuple(self))
+        return np.array([*vars(self).values()])
 
     @property
     def done(self) -> int:

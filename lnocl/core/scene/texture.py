@@ -13,6 +13,7 @@ docs/validation/errors.md.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 
 import numpy as np
@@ -36,6 +37,8 @@ CORRELATED, SMOOTHED, SMOOTHED_NEAR = 0.4, 0.55, 0.28
 CORE, NEAR, ROUND, EDGE = 0.85, 1.1, 1.65, 0.4
 # The farthest that a star may be from the middle of its pixel.
 HALF_PIXEL = 0.5**0.5
+# Of images with sides of so many pixels or more every third is taken for a median, and so on.
+FEWER = 512
 # What is expected under the core is at most so many times the mean round it.
 STEEPEST = 4.0
 
@@ -153,15 +156,18 @@ def _width(power: Array) -> float:
 def _depths(scene: Scene) -> Array:
     """Return the information on a flat sky that each image has, as shares of all, shape (p,).
 
-    Its counts' variance is the median of its pixels, or their mean where most have none.
+    Its counts' variance is the median of its pixels, or their mean where most have none. Of many
+    pixels some are taken, as that is asked for again and again.
     """
     observation, depths = scene.observation, np.zeros(scene.n_images)
+    step = 2 * (math.isqrt(math.prod(observation.shape)) // FEWER) + 1
     exposures = np.broadcast_to(observation.exposure.T, observation.images.T.shape).T
-    for j, (image, mask) in enumerate(zip(observation.images, observation.mask, strict=True)):
+    maps = (each[:, ::step, ::step] for each in (observation.images, observation.mask, exposures))
+    for j, (image, mask, exposure) in enumerate(zip(*maps, strict=True)):
         counts = image[~mask]
         if counts.size:
             variance = float(np.median(counts)) or max(float(counts.mean()), 1.0 / counts.size)
-            each = float(exposures[j][~mask].mean()) * scene.seen_areas[j]
+            each = float(exposure[~mask].mean()) * scene.seen_areas[j]
             depths[j] = counts.size * each**2 / variance
     return depths / depths.sum()
 
