@@ -14,8 +14,9 @@
 /* Share of a star's flux that one step may take at most, and rounds of projections to that. */
 #define MOST_FADING ((real)0.9)
 #define N_ROUNDS 64
-/* A star this share of its flux below that is as good as there. */
+/* A star is as good as there within this share of its flux, and that of how far it was pushed. */
 #define NEARLY ((real)1e-3)
+#define EVEN ((real)1e-6)
 /* Why a run has ended. */
 enum { PAUSED, SETTLED, STUCK, NOT_FINITE };
 
@@ -65,11 +66,14 @@ INLINE void bounded_step(
     BARRIER;
     int n_rounds = N_ROUNDS;
     for (int round = 0; round < n_rounds; ++round) {
-        real_sum below = {0, 0};
-        for (int s = ITEM; s < n_stars; s += GROUP)
-            below.sum += change[s] < -(MOST_FADING + NEARLY) * fluxes[s];
-        below = sum_group(below, shared);
-        n_rounds = below.sum > 0 ? n_rounds : 0;
+        real_sum away = {0, 0};
+        for (int s = ITEM; s < n_stars; s += GROUP) {
+            const real variance = star_inverse[(size_t)s * n_stars + s];
+            const real lift = lift_of(change[s], -MOST_FADING * fluxes[s], pushes[s], variance);
+            away.sum += fabs(lift) * variance > NEARLY * fluxes[s] + EVEN * pushes[s] * variance;
+        }
+        away = sum_group(away, shared);
+        n_rounds = away.sum > 0 ? n_rounds : 0;
         for (int t = 0; t < (n_rounds > 0 ? n_stars : 0); ++t) {
             const real lift = lift_of(
                 change[t], -MOST_FADING * fluxes[t], pushes[t],

@@ -169,6 +169,15 @@ def test_bounded_steps_are_those_of_least_squares_within_bounds(scene):
     assert value(found) - least <= 5e-3 * abs(least)
 
 
+def test_a_star_that_another_pushes_above_its_bound_is_let_back():
+    """Stars without light are held at 0 where they are; a run was taken to have converged there."""
+    inverse = np.array([[43.6, -36.4, 0.07], [-36.4, 43.6, -0.09], [0.07, -0.09, 13.3]])
+    force, before = np.array([0.0124, -4e-5, 9.35e-3]), np.array([1.7e-15, 0.0415, 1.7e-15])
+    found = bounded_step(inverse, force, before)
+    assert found[1] == pytest.approx(-force[1] / np.linalg.inv(inverse)[1, 1], rel=1e-5)
+    assert (found[[0, 2]] == -0.9 * before[[0, 2]]).all()
+
+
 @pytest.mark.parametrize("engine", FEWER_ENGINES)
 @pytest.mark.parametrize("solver", ["sgm", "sgp"])
 def test_a_run_is_bit_for_bit_the_same_however_it_is_looked_at(engine, solver):

@@ -29,4 +29,4 @@ def test_reasons_and_constants_are_those_of_the_kernels():
     assert {name: float(value) for name, value in defined.items()} == {
         name: own.get(name) or (vars(band_matrix) | vars(decide))[name] for name in defined
     }
-    assert len(defined) == 9
+    assert len(defined) == 10

@@ -29,8 +29,9 @@ if TYPE_CHECKING:
 # Star positions are refined after this many iterations, then after twice as many each time.
 FIRST_REFINED = 3
 # Iterations that are queued at once: as many as have so many pixels, so that an interrupt is
-# answered soon, and no more than this, as the device runs idle while the host looks.
-AHEAD_PIXELS, MOST_AHEAD = 2**26, 64
+# answered soon, and no more than this, as the device runs idle while the host looks; fewer where a
+# run may settle meanwhile.
+AHEAD_PIXELS, MOST_AHEAD = 2**26, (64, 16)
 
 
 class Run:
@@ -76,8 +77,8 @@ class Run:
     ) -> None:
         self._setup, self.n_iter, self._half = start.setup, n_iter, half
         self.scene, self.tolerance = copy(start.scene), tolerance
-        pixels = self.scene.n_images * math.prod(self.scene.grid)
-        self.stride, self.goal = min(max(AHEAD_PIXELS // pixels, 1), MOST_AHEAD), n_iter
+        ahead = AHEAD_PIXELS // (self.scene.n_images * math.prod(self.scene.grid))
+        self.stride, self.goal = min(max(ahead, 1), MOST_AHEAD[tolerance > 0]), n_iter
         self._refines = start.refines
         self.engine = _make_engine(self._setup, self.scene, n_iter, start.scaling, half)
         self._begin(start)

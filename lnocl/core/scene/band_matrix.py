@@ -15,10 +15,11 @@ from lnocl.core.scene.arrays import Array
 # singular: where less than this is left of an unknown beside the others.
 ROUNDING = 1e-12
 # A star's flux falls by this share at most in one step, so that it never reaches 0 by a step that
-# was too long; rounds in which steps are brought there, and what is as good as there.
+# was too long; rounds in which steps are brought there, and what is as good as there, as shares of
+# the flux and of how far it was pushed.
 MOST_FADING = 0.9
 N_ROUNDS = 64
-NEARLY = 1e-3
+NEARLY, EVEN = 1e-3, 1e-6
 
 
 class BandMatrix:
@@ -136,14 +137,15 @@ def bounded_step(star_inverse: Array, force: Array, fluxes: Array) -> Array:
     below its bound is pushed there, and pushes the others.
     """
     least = -MOST_FADING * fluxes
+    variances, pushes = star_inverse.diagonal(), np.zeros(len(fluxes))
     # Without BLAS, whose rounding depends on the number of threads.
-    change, pushes = -(star_inverse * force).sum(axis=1), np.zeros(len(fluxes))
+    change, known = -(star_inverse * force).sum(axis=1), np.flatnonzero(variances > 0)
     for _ in range(N_ROUNDS):
-        if not (change < least - NEARLY * fluxes).any():
+        away = abs(np.maximum(least - change, -pushes * variances))[known]
+        if (away <= (NEARLY * fluxes + EVEN * pushes * variances)[known]).all():
             break
-        for t, variances in enumerate(star_inverse):
-            if variances[t] > 0:
-                lift = max((least[t] - change[t]) / variances[t], -pushes[t])
-                change += lift * variances
-                pushes[t] += lift
+        for t in known:
+            lift = max((least[t] - change[t]) / variances[t], -pushes[t])
+            change += lift * star_inverse[t]
+            pushes[t] += lift
     return np.where(pushes > 0, least, np.maximum(change, least))  # without rounding
