@@ -299,6 +299,7 @@ class Outcome:
     def star_errors(self) -> tuple[Array, Array]:
         """Return the standard errors of fluxes and positions, the extended source not known.
 
+        Those of stars with PSFs of their own have how far they would be without it.
         Fluxes are those of stars and halos. `lnocl.core.solvers.star_errors` has the equation. Of
         PSFs that are said to be exact, and are not, the relative error that is left is that of each
         star's flux too, added in quadrature. NaN for positions that were not fitted, and where the
@@ -310,19 +311,19 @@ class Outcome:
             The images do not determine flux and position of a star, or the amount of a halo.
         """
         from lnocl.core.solvers.halos import halo_errors
-        from lnocl.core.solvers.star_errors import standard_errors
+        from lnocl.core.solvers.star_errors import standard_errors, without_source
 
         scene, moves = self.scene, self.moves
         star_fluxes = self.star_fluxes[: scene.n_stars]
         halos = halo_errors(self.estimate)
         errors = standard_errors(self.estimate, moves, halos.raised, self.levels)
+        errors[:, 0] = np.hypot(errors[:, 0], without_source(self.estimate, halos.raised))
         is_lost = np.isnan(errors[:, : 3 if moves else 1]).any(axis=1) & (star_fluxes > 0)
         _warn_of_undetermined(scene.stars[is_lost], bool(np.isnan(halos.errors).any()))
         if self.psf_refinement is not None:
-            refinement = self.psf_refinement
             # Else what PSFs may have wrong is among the unknowns.
-            left = refinement.psf_error * (self.scene.observation.psf_error == 0)
-            of_psfs = np.hypot(left, refinement.hidden_error)
+            left = self.psf_refinement.psf_error * (scene.observation.psf_error == 0)
+            of_psfs = np.hypot(left, self.psf_refinement.hidden_error)
             errors[:, 0] = np.hypot(errors[:, 0], of_psfs * star_fluxes)
         positions = errors[:, 1:]
         positions[positions > MAX_SHIFT] = np.nan  # no star is moved farther

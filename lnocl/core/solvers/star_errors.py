@@ -15,10 +15,9 @@ conjugate gradients, in a window round each star (`lnocl.core.solvers.near_star`
 A level of the background that is not known adds the square of what it changes in a star.
 
 The same least squares tell how far a star is from where they are least, as the extended source is
-not where it is expected or iterations have ended early. The square of that is added. So is that of
-how far a star with a PSF of its own would be without an extended source: the PSF may be as wide as
-that, which noise alone makes positive. So is the square of what is of second order in the error e
-of PSFs, the share e^2 of a flux (docs/validation/psf_error.md).
+not where it is expected or iterations have ended early. The square of that is added. So is the
+square of what is of second order in the error e of PSFs, the share e^2 of a flux
+(docs/validation/psf_error.md).
 """
 
 from __future__ import annotations
@@ -73,24 +72,25 @@ def standard_errors(
     for first in range(0, scene.n_stars, n_epochs):  # which lies there in all epochs
         near = NearStar(around, first, finished)
         there = range(first, first + n_epochs)
-        is_it = np.isin(near.held, there)
-        errors[first : first + n_epochs, :k] = _errors_of(near, is_it, levels)
-        if scene.owned[first] >= 0:
-            errors[there, 0] = np.hypot(errors[there, 0], _in_extended(near, is_it, estimate))
+        errors[first : first + n_epochs, :k] = _errors_of(near, np.isin(near.held, there), levels)
     errors[:, 0] *= scene.unit
     second_order = scene.observation.psf_error**2 * estimate.star_fluxes[: scene.n_stars]
     errors[:, 0] = np.hypot(errors[:, 0], second_order)
     return errors
 
 
-def _in_extended(near: NearStar, wanted: NDArray[np.bool_], estimate: Estimate) -> Array:
-    """Return the changes of fluxes that are fitted, were there no extended source in the window.
+def without_source(estimate: Estimate, raised: Array) -> Array:
+    """Return how far each star with a PSF of its own would be without an extended source, (n,).
 
-    A PSF of its own may be as wide as what is beside the star, which noise alone makes positive.
+    That is in electrons, and 0 for other stars. Such a PSF may be as wide as the extended source,
+    which noise alone makes positive. `raised` is as for `standard_errors`.
     """
-    seen = near.source.images_of(estimate.part(near.places(estimate.scene)))
-    rows = [near.fit.row(i)[1] for i in near.unknowns[wanted, 0].tolist()]
-    return np.array([np.vdot(row, seen) for row in rows])
+    scene, found = estimate.scene, np.zeros(estimate.scene.n_stars)
+    for star in np.flatnonzero(scene.owned >= 0).tolist():
+        near = NearStar(Surroundings(estimate, False, raised), star, FINISHED)
+        seen = near.source.images_of(estimate.part(near.places(scene)))
+        found[star] = scene.unit * np.vdot(near.fit.row(int(near.unknowns[0, 0]))[1], seen)
+    return found
 
 
 def _errors_of(near: NearStar, wanted: NDArray[np.bool_], levels: Levels | None) -> Array:
