@@ -16,7 +16,7 @@
 #define N_ROUNDS 64
 /* A star is as good as there within this share of its flux, and that of how far it was pushed. */
 #define NEARLY ((real)1e-3)
-#define EVEN ((real)1e-6)
+#define PUSHED ((real)1e-6)
 /* Why a run has ended. */
 enum { PAUSED, SETTLED, STUCK, NOT_FINITE };
 
@@ -70,7 +70,7 @@ INLINE void bounded_step(
         for (int s = ITEM; s < n_stars; s += GROUP) {
             const real variance = star_inverse[(size_t)s * n_stars + s];
             const real lift = lift_of(change[s], -MOST_FADING * fluxes[s], pushes[s], variance);
-            away.sum += fabs(lift) * variance > NEARLY * fluxes[s] + EVEN * pushes[s] * variance;
+            away.sum += fabs(lift) * variance > NEARLY * fluxes[s] + PUSHED * pushes[s] * variance;
         }
         away = sum_group(away, shared);
         n_rounds = away.sum > 0 ? n_rounds : 0;

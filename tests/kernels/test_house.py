@@ -1,5 +1,7 @@
 """Kernel, twin and test stand under one name each; what the comparison itself relies on."""
 
+import re
+from collections import defaultdict
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +24,17 @@ def test_kernel_twin_and_test_have_one_name(name):
         assert f"def {kernel}(" in twins.read_text(encoding="utf-8")
         assert callable(getattr(reference, kernel))
     assert f"| `{name}.cl` |" in (FOLDER / "README.md").read_text(encoding="utf-8")
+
+
+def test_no_file_defines_a_macro_of_another():
+    """All files are one program, in which the later definition would hold without a word."""
+    definition = re.compile(r"^ *# *define +(\w+)", re.MULTILINE)
+    files = defaultdict(set)
+    for path in FOLDER.glob("*.cl"):
+        for name in definition.findall(path.read_text(encoding="ascii")):
+            files[name].add(path.stem)
+    assert "EVEN" in files
+    assert not {name: where for name, where in files.items() if len(where) > 1}
 
 
 def test_every_kernel_is_compared():

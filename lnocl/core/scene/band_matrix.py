@@ -19,7 +19,7 @@ ROUNDING = 1e-12
 # the flux and of how far it was pushed.
 MOST_FADING = 0.9
 N_ROUNDS = 64
-NEARLY, EVEN = 1e-3, 1e-6
+NEARLY, PUSHED = 1e-3, 1e-6
 
 
 class BandMatrix:
@@ -142,7 +142,7 @@ def bounded_step(star_inverse: Array, force: Array, fluxes: Array) -> Array:
     change, known = -(star_inverse * force).sum(axis=1), np.flatnonzero(variances > 0)
     for _ in range(N_ROUNDS):
         away = abs(np.maximum(least - change, -pushes * variances))[known]
-        if (away <= (NEARLY * fluxes + EVEN * pushes * variances)[known]).all():
+        if (away <= (NEARLY * fluxes + PUSHED * pushes * variances)[known]).all():
             break
         for t in known:
             lift = max((least[t] - change[t]) / variances[t], -pushes[t])
