@@ -71,7 +71,7 @@ class HeldOutCounts:
         self, start: Start, penalties: Sequence[Penalty], n_iter: int, stride: int
     ) -> None:
         self._start, self._penalties, self._n_iter = start, penalties, n_iter
-        self._stride = stride
+        self._stride, self._shape = stride, start.scene.observation.sky_shape
         self._counts = split_counts(start.scene.observation)
         self._curves: list[NDArray[np.void]] = []
         self._first: _First | None = None
@@ -178,10 +178,6 @@ class HeldOutCounts:
         oldest = min(OLDEST_SNAPSHOT * chosen, best)
         halves.snapshots = [each for each in halves.snapshots if each.iteration >= oldest]
         return last.iteration >= self._next_look
-
-    @property
-    def _shape(self) -> tuple[int, int]:
-        return self._start.scene.observation.sky_shape
 
     def _judge(self, halves: Halves) -> bool:
         """Record the errors of one penalty; return whether they are the least so far."""

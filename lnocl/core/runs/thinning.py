@@ -14,8 +14,8 @@ from lnocl.errors import InputError
 MAX_COUNTS = 2.0**62
 # With the index of an image.
 SEED = 0
-# Of so many counts each is dealt out by a random bit.
-BITS = 64
+# Of so many counts each is dealt out by a random bit, in so many rows at once.
+BITS, ROWS = 64, 128
 
 
 def split_counts(observation: Observation) -> tuple[Observation, Observation]:
@@ -38,8 +38,9 @@ def split_counts(observation: Observation) -> tuple[Observation, Observation]:
             f"a pixel of {images.max():.3g} electrons is too bright to be split; give `n_iter` and "
             "`stop` None"
         )
+    first = np.empty_like(images)
     with ThreadPoolExecutor() as threads:
-        first = np.array([*threads.map(_half, enumerate(images))])
+        list(threads.map(_deal_out, range(len(images)), images, first))  # which raises its errors
     background = observation.background / 2.0
     return (
         observation.replace(images=first, background=background),
@@ -47,15 +48,14 @@ def split_counts(observation: Observation) -> tuple[Observation, Observation]:
     )
 
 
-def _half(indexed: tuple[int, Array]) -> Array:
-    """Return half the counts of an image, given with its index, which no other image changes."""
-    j, image = indexed
+def _deal_out(j: int, image: Array, half: Array) -> None:
+    """Write half the counts of image j, which no other image changes."""
     rng = np.random.default_rng((SEED, j))
-    whole = np.floor(image)
-    counts = whole.astype(np.uint64)
-    bits = rng.integers(2**BITS, size=image.shape, dtype=np.uint64)
-    half = np.bitwise_count(bits >> (BITS - np.minimum(counts, BITS))).astype(np.float64)
-    many = counts > BITS
-    half[many] = rng.binomial(whole[many].astype(np.int64), 0.5)
-    half += (image - whole) * rng.integers(0, 2, image.shape)
-    return half
+    for begin in range(0, len(image), ROWS):
+        rows = slice(begin, begin + ROWS)
+        counts = image[rows].astype(np.uint64)
+        bits = rng.integers(2**BITS, size=counts.shape, dtype=np.uint64)
+        dealt = np.bitwise_count(bits >> (BITS - np.minimum(counts, BITS))).astype(np.float64)
+        many = counts > BITS
+        dealt[many] = rng.binomial(counts[many].astype(np.int64), 0.5)
+        half[rows] = dealt + (image[rows] - counts) * rng.integers(0, 2, counts.shape)
