@@ -33,6 +33,12 @@ def test_a_jet_beside_a_host_adds_little_to_it():
     assert host(HOST + JET) == pytest.approx(host(HOST), rel=0.05)
 
 
+def test_a_bright_jet_far_off_on_one_side_does_not_hide_a_host():
+    """The mean of all that is far off is then above what lies all round the star."""
+    far_jet = 20.0 * JET * (R > 2.0 * WIDTH)
+    assert host(HOST + far_jet) == pytest.approx(host(HOST), rel=0.01)
+
+
 def test_where_nothing_is_observed_belongs_to_the_star():
     hidden = 5.0
     seen = HOST * (hidden < R)

@@ -7,8 +7,8 @@ import numpy as np
 from lnocl.core.scene.arrays import Array
 from lnocl.core.scene.texture import CORE, ROUND
 
-# How far off a host is fainter, resolutions, and the sectors in which it is looked for.
-FAR, SECTORS = 3.0, 8
+# Where a host is looked for and where it is fainter, resolutions, each in so many sectors.
+RINGS, SECTORS = ((CORE, ROUND), (ROUND, 3.0)), 8
 
 
 def light_of_host(
@@ -16,8 +16,8 @@ def light_of_host(
 ) -> float:
     """Return the light of the host of a star within `ROUND`, in units of the sky.
 
-    It is as bright under the star as between `CORE` and `ROUND`, by the lower quartile of sectors:
-    a jet is on one side. Where the sky is brighter farther off, as in a ring, there is none.
+    It is as bright under the star as in the first of `RINGS`, by the lower quartile of sectors: a
+    jet is on one side. Where the second is brighter by that, as in a ring, there is none.
 
     Parameters
     ----------
@@ -32,10 +32,14 @@ def light_of_host(
     """
     distance = (np.hypot(rows, columns) - hidden) / resolution
     sector = ((np.arctan2(rows, columns) / (2.0 * np.pi) + 0.5) * SECTORS).astype(int) % SECTORS
-    is_round, is_far = ((distance > a) & (distance <= b) for a, b in ((CORE, ROUND), (ROUND, FAR)))
-    parts = [sky[is_round & (sector == k)] for k in range(SECTORS)]
+    near, far = (
+        _lower_quartile([sky[is_there & (sector == k)] for k in range(SECTORS)])
+        for is_there in ((distance > a) & (distance <= b) for a, b in RINGS)
+    )
+    return near * float(np.count_nonzero(distance <= ROUND)) if near > far else 0.0
+
+
+def _lower_quartile(parts: list[Array]) -> float:
+    """Return that of the means of parts, 0 without any."""
     means = sorted(float(part.mean()) for part in parts if part.size)
-    level = means[len(means) // 4] if means else 0.0
-    if is_far.any() and level <= sky[is_far].mean():
-        return 0.0
-    return level * float(np.count_nonzero(distance <= ROUND))
+    return means[len(means) // 4] if means else 0.0
