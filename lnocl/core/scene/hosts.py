@@ -17,7 +17,8 @@ def light_of_host(
     """Return the light of the host of a star within `ROUND`, in units of the sky.
 
     It is as bright under the star as in the first of `RINGS`, by the lower quartile of sectors: a
-    jet is on one side. Where the second is brighter by that, as in a ring, there is none.
+    jet is on one side. Where the second is brighter by that and in the mean, as in a ring, there is
+    none.
 
     Parameters
     ----------
@@ -32,11 +33,12 @@ def light_of_host(
     """
     distance = (np.hypot(rows, columns) - hidden) / resolution
     sector = ((np.arctan2(rows, columns) / (2.0 * np.pi) + 0.5) * SECTORS).astype(int) % SECTORS
-    near, far = (
-        _lower_quartile([sky[is_there & (sector == k)] for k in range(SECTORS)])
-        for is_there in ((distance > a) & (distance <= b) for a, b in RINGS)
-    )
-    return near * float(np.count_nonzero(distance <= ROUND)) if near > far else 0.0
+    is_round, is_far = ((distance > a) & (distance <= b) for a, b in RINGS)
+    level = _lower_quartile([sky[is_round & (sector == k)] for k in range(SECTORS)])
+    far = _lower_quartile([sky[is_far & (sector == k)] for k in range(SECTORS)])
+    if is_far.any() and level <= min(far, sky[is_far].mean()):
+        return 0.0
+    return level * float(np.count_nonzero(distance <= ROUND))
 
 
 def _lower_quartile(parts: list[Array]) -> float:
