@@ -313,9 +313,8 @@ class Outcome:
         from lnocl.core.solvers.halos import halo_errors
         from lnocl.core.solvers.star_errors import standard_errors, without_source
 
-        scene, moves = self.scene, self.moves
+        scene, moves, halos = self.scene, self.moves, halo_errors(self.estimate)
         star_fluxes = self.star_fluxes[: scene.n_stars]
-        halos = halo_errors(self.estimate)
         errors = standard_errors(self.estimate, moves, halos.raised, self.levels)
         errors[:, 0] = np.hypot(errors[:, 0], without_source(self.estimate, halos.raised))
         is_lost = np.isnan(errors[:, : 3 if moves else 1]).any(axis=1) & (star_fluxes > 0)

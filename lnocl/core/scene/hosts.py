@@ -34,8 +34,8 @@ def light_of_host(
     distance = (np.hypot(rows, columns) - hidden) / resolution
     sector = ((np.arctan2(rows, columns) / (2.0 * np.pi) + 0.5) * SECTORS).astype(int) % SECTORS
     is_round, is_far = ((distance > a) & (distance <= b) for a, b in RINGS)
-    level = _lower_quartile([sky[is_round & (sector == k)] for k in range(SECTORS)])
-    far = _lower_quartile([sky[is_far & (sector == k)] for k in range(SECTORS)])
+    rings = ([sky[ring & (sector == k)] for k in range(SECTORS)] for ring in (is_round, is_far))
+    level, far = map(_lower_quartile, rings)
     if is_far.any() and level <= min(far, sky[is_far].mean()):
         return 0.0
     return level * float(np.count_nonzero(distance <= ROUND))

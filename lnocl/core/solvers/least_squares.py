@@ -31,7 +31,8 @@ from lnocl.core.scene.smooth_field import SmoothField
 MISSING, NEGLIGIBLE = 1e-4, 1e-4
 # Derivatives of which a smaller share is not 0 are held as a sparse array.
 SPARSE = 0.25
-# Added to the diagonal of the information, which is scaled to 1 before, where it is not less.
+# Added to the diagonal of the information, which is scaled to 1 before; less than the second is no
+# information.
 ROUNDING, LEAST = 1e-12, 1e-290
 
 
@@ -143,7 +144,7 @@ class LeastSquares:
     images : list of LinearImage
         The images, of one shape.
     fields : list of Field
-        The fields; one at least.
+        The fields; one at least, but for `moments` and `invert`.
     prior : ndarray of float64, shape (k,) or (k, k)
         One over the variance of the prior of each parameter, whose mean is 0; 0 for no prior. Or
         the inverse of their covariance.
