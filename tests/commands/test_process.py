@@ -214,7 +214,8 @@ class TestDevices:
         assert cli.main(["devices", "--tune"]) == 0
         lines = capsys.readouterr().out.splitlines()
         assert [line.endswith("<- taken from now on") for line in lines[1:5]] == [0, 1, 1, 0]
-        assert lines[-1] == f"stored in {tmp_path / 'tunings.json'}"
+        (file,) = tmp_path.glob("*.tunings")
+        assert lines[-1] == f"stored in {file}"
         assert cli.main(["devices"]) == 0
         assert ", as measured" in capsys.readouterr().out
         for dtype, index in zip(tried, (1, 0), strict=True):

@@ -21,10 +21,10 @@ SAID = "print(deconvolve())"
 
 @pytest.fixture(scope="module")
 def warm(tmp_path_factory):
-    """The file of one program: its name, its content, and the result of the run that made it."""
+    """The file of the first program: its name and content, and the result of the run with it."""
     folder = tmp_path_factory.mktemp("store")
     done = run_python(SAID, POCL_CACHE_DIR=str(folder))
-    (file,) = folder.glob("*.kernels")
+    (file,) = (each for each in folder.glob("*.kernels") if b"rfft_rows/" in each.read_bytes())
     return file.name, file.read_bytes(), done.stdout
 
 
@@ -40,8 +40,7 @@ def test_programs_are_stored_and_used_again(warm, tmp_path):
     done = run_python(code, POCL_CACHE_DIR=str(tmp_path))
     assert done.stdout == f"{said}{tmp_path}\n"
     assert not done.stderr
-    (file,) = tmp_path.glob("*.kernels")
-    assert file.read_bytes() == content
+    assert (tmp_path / name).read_bytes() == content
 
 
 def middle(content):
@@ -67,10 +66,7 @@ def test_damaged_programs_are_compiled_anew(warm, tmp_path, damage):
     done = run_python(SAID, POCL_CACHE_DIR=str(tmp_path))
     assert done.returncode == 0, done.stderr
     assert done.stdout == said
-    assert (
-        f"the compiled kernels in {tmp_path / name} are damaged, and are compiled anew"
-        in done.stderr
-    )
+    assert f"{tmp_path / name} is damaged, and is not used" in done.stderr
     assert kernel_cache.read(tmp_path / name) is not None
 
 
@@ -97,7 +93,7 @@ def test_a_disk_that_is_full_cuts_no_kernel_short(tmp_path, monkeypatch):
     assert kernel_cache.pack(kernel_cache.folders()) == content
 
 
-@pytest.mark.filterwarnings("ignore:the compiled kernels in")
+@pytest.mark.filterwarnings("ignore:.* is damaged, and is not used")
 def test_of_a_damaged_file_nothing_is_used(tmp_path):
     rng = np.random.default_rng(1)
     binary, file = rng.bytes(5000), tmp_path / "program.bin"
@@ -163,7 +159,7 @@ class TestStrangers:
     @pytest.mark.parametrize("mode", [0o620, 0o602, 0o666])
     def test_a_file_that_others_may_write_to_is_not(self, file, mode):
         file.chmod(mode)
-        with pytest.warns(lnocl.LnoclWarning, match="can be written by others, and are not used"):
+        with pytest.warns(lnocl.LnoclWarning, match="can be written by others, and is not used"):
             assert kernel_cache.read(file) is None
 
     def test_a_file_of_another_user_is_not(self, file, monkeypatch):
@@ -205,7 +201,7 @@ def test_a_file_that_is_too_large_is_not_read(tmp_path, monkeypatch):
     kernel_cache.write(file, bytes(200))
     assert kernel_cache.read(file) == bytes(200)
     monkeypatch.setattr(kernel_cache, "MAX_STORED", 100)
-    with pytest.warns(lnocl.LnoclWarning, match="are damaged, and are compiled anew"):
+    with pytest.warns(lnocl.LnoclWarning, match="is damaged, and is not used"):
         assert kernel_cache.read(file) is None
     assert not file.exists()
 

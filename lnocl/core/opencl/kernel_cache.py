@@ -211,7 +211,7 @@ def read(file: Path) -> bytes | None:
             if not stat.S_ISREG(state.st_mode):
                 return None
             if hasattr(os, "getuid") and (state.st_uid != os.getuid() or state.st_mode & 0o022):
-                warn(f"the compiled kernels in {file} can be written by others, and are not used")
+                warn(f"{file} can be written by others, and is not used")
                 return None
             content = stream.read() if state.st_size <= MAX_STORED else b""
     except OSError:
@@ -232,7 +232,7 @@ def _without_waiting(name: str, flags: int) -> int:
 
 def discard(file: Path) -> None:
     """Remove a file whose content cannot be used, and say so."""
-    warn(f"the compiled kernels in {file} are damaged, and are compiled anew")
+    warn(f"{file} is damaged, and is not used")
     with contextlib.suppress(OSError):
         file.unlink()
 

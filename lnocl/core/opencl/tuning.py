@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import json
-import stat
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -15,10 +14,8 @@ import pyopencl as cl
 from lnocl.core.opencl import kernel_cache
 from lnocl.core.opencl.device import describe
 from lnocl.core.scene.line_weights import TAPS
-from lnocl.errors import FileError, warn
+from lnocl.errors import FileError
 
-FILE = "tunings.json"
-MAX_BYTES = 2**16
 # Bytes that a device reads or writes at once.
 SECTOR = 32
 
@@ -148,8 +145,7 @@ def measured(device: cl.Device, dtype: np.dtype) -> Tuning | None:
     LnoclWarning
         The file of what was measured is damaged.
     """
-    known = _read().get(describe(device), {})
-    words = known.get(dtype.name) if isinstance(known, dict) else None
+    words = json.loads(kernel_cache.read(_file(device)) or b"{}").get(dtype.name)
     return next((each for each in candidates(device, dtype) if asdict(each) == words), None)
 
 
@@ -161,17 +157,20 @@ def store(device: cl.Device, fastest: Mapping[np.dtype, Tuning]) -> Path:
     FileError
         It cannot be written.
     """
-    file = kernel_cache.store() / FILE
-    known = _read() | {describe(device): {dtype.name: asdict(t) for dtype, t in fastest.items()}}
+    file, known = _file(device), {dtype.name: asdict(each) for dtype, each in fastest.items()}
     with contextlib.suppress(OSError):
         file.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
-    kernel_cache.replace(file, json.dumps(known, indent=1).encode("ascii"))
-    if _read() != known:
+    kernel_cache.write(file, content := json.dumps(known).encode("ascii"))
+    if kernel_cache.read(file) != content:
         raise FileError(
             f"the tunings cannot be written to {file}; set {kernel_cache.VARIABLE} to a folder "
             "that can be written to, for this command and later ones"
         )
     return file
+
+
+def _file(device: cl.Device) -> Path:
+    return kernel_cache.file_of(describe(device)).with_suffix(".tunings")
 
 
 def in_words(tuning: Tuning, dtype: np.dtype) -> str:
@@ -187,29 +186,6 @@ def describe_tuning(device: cl.Device, dtype: np.dtype, used: Tuning | None = No
     if measured(device, dtype):
         return f"{words}, as measured"
     return f"{words}; lnocl devices --tune measures whether others are faster"
-
-
-_damaged: set[Path] = set()  # of which was warned
-
-
-def _read() -> dict[str, object]:
-    """Return the tunings that were measured, by device and precision."""
-    file = kernel_cache.store() / FILE
-    with contextlib.suppress(OSError):
-        state = file.stat()
-        if not stat.S_ISREG(state.st_mode) or state.st_size > MAX_BYTES:
-            return {}
-        try:
-            known = json.loads(file.read_bytes())
-        except (ValueError, RecursionError):
-            known = None
-        if isinstance(known, dict):
-            return known
-        if file in _damaged:
-            return {}
-        _damaged.add(file)
-        warn(f"the tunings in {file} are damaged, and not used; run lnocl devices --tune again")
-    return {}
 
 
 def _power_of_2_up_to(n: int) -> int:

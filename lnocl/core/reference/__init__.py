@@ -21,28 +21,3 @@ from lnocl.core.reference.turn import (
     sample_lines,
     unshear_columns,
 )
-
-__all__ = [
-    "collect_sums",
-    "convolve_columns",
-    "correlate_columns",
-    "fft_columns",
-    "follow_stars",
-    "gather_rows",
-    "gradient_rows",
-    "ifft_columns",
-    "irfft_rows",
-    "irfft_sheared",
-    "otf_columns",
-    "ratio_rows",
-    "ratio_sheared",
-    "rfft_rows",
-    "rfft_sheared",
-    "sample_lines",
-    "scale_rows",
-    "shortened",
-    "smooth",
-    "step_rows",
-    "transmit_rows",
-    "unshear_columns",
-]

@@ -167,7 +167,8 @@ class GuardedRuns:
         setup = replace(self.setup_of(psfs, stars), refine_positions=moves)
         with ignored_warnings(), ignored_notes():  # those of the reconstruction are the same
             start = settle_halos(make_start(setup, Penalty()))
-            found = _judged(start.estimate(), _unknown(error))
+            nothing_measured = PsfMisfit(np.array([error**2]), 0.0, 0.0, 1.0, np.array([error]))
+            found = _judged(start.estimate(), nothing_measured)
             moved = replace(setup, refine_positions=False)
             rounds = (moved, FIRST_ITERATIONS), *[(setup, ITERATIONS)] * (MAX_ROUNDS - 1)
             for each, n_iter in rounds:
@@ -399,11 +400,6 @@ def rings_of(psfs: Array, oversample: int) -> Rings:
 
 def _judged(estimate: Estimate, misfit: PsfMisfit) -> Judged:
     return Judged(estimate.scene, estimate.sky, estimate.star_fluxes, misfit)
-
-
-def _unknown(error: float) -> PsfMisfit:
-    """Return a misfit with this relative error of the PSFs at all radii, before any is measured."""
-    return PsfMisfit(np.array([error**2]), 0.0, 0.0, 1.0, np.array([error]))
 
 
 def _is_settled(before: PsfMisfit, after: PsfMisfit) -> bool:

@@ -187,7 +187,7 @@ class Geometry:
     def upright(self) -> Geometry:
         """Return that of images without quarter turns and flips; itself where there are none."""
         orientations, angles = zip(*map(Orientation.nearest, self.turns), strict=True)
-        if all(orientation.is_identity for orientation in orientations):
+        if not any(each.swaps or any(each.reversed) for each in orientations):
             return self
         swaps = any(orientation.swaps for orientation in orientations)
         shape = (max(self.shape),) * 2 if swaps else self.shape

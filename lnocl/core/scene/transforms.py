@@ -183,11 +183,6 @@ class Orientation(NamedTuple):
             np.arctan2(left[1, 0], left[0, 0])
         )
 
-    @property
-    def is_identity(self) -> bool:
-        """Whether it changes nothing."""
-        return not (self.swaps or any(self.reversed))
-
     def of(self, array: NDArray[Any]) -> NDArray[Any]:
         """Return a view of an array whose last axes are (y, x)."""
         return self._reversed(array.swapaxes(-1, -2) if self.swaps else array)
