@@ -128,9 +128,9 @@ def without_objective(scene, device):
     """Return lnocl's iterations with kernels that leave the objective out."""
     source = program.source
     text = source()
-    line = "*term = divergence(modelled, quotient);"
+    line = "apart = divergence(modelled, quotient);"
     assert text.count(line) == 1
-    text = text.replace(line, "*term = 0;")
+    text = text.replace(line, "apart = 0;")
     program.source = lambda: text
     try:
         return sides.Lnocl(scene, np.float32, device)

@@ -54,7 +54,7 @@ class Profile:
 
         def call(launch):
             event = self._call(launch)
-            self.events.append((launch._kernel.function_name, event))
+            self.events.append((launch._name, event))
             return event
 
         Launch.__call__ = call

@@ -14,6 +14,8 @@ typedef vec unaligned_vec __attribute__((aligned(sizeof(real))));
 
 /* Point i of a block; x is already at this work-item's vector of the block. */
 #define LOAD(x, i) ((cvec){(x)[2 * (i) * SIDE], (x)[(2 * (i) + 1) * SIDE]})
+/* The same of a map, or its one point where that holds for all; a product would take registers. */
+#define LOAD_MAP(x, has_map, i) LOAD(x, (i) & -(has_map))
 #define STORE(x, i, value)                      \
     do {                                        \
         (x)[2 * (i) * SIDE] = (value).re;       \

@@ -17,7 +17,6 @@
  *   OVERSAMPLE      pixels of the sky to one of the images, along each axis: 1, 2 or 4; 2 BLOCK
  *                   OVERSAMPLE divides that power of two
  *   ROWS            rows that a block of spectra takes in memory: NY and some padding
- *   HAS_WEIGHTS, HAS_BACKGROUND_MAP, HAS_EXPOSURE_MAP   0 or 1: what the scene has
  *   HAS_TURNS       0 or 1: whether images are turned against the sky; then OVERSAMPLE is 1
  *   TURN_TAPS, PHASE_ROWS, COLUMN_PAIRS   weights of a shift, rows between those whose phases are
  *                   tabled, and pairs of rows in a piece of a column, see turn.cl

@@ -52,31 +52,21 @@ INLINE vec divergence(const vec m, const vec r)
     return m * (r * (e * LN_2) + (1 - power) + power * w2 * (even + w * odd));
 }
 
-/* How a pixel is known that was not observed: by its value, or by its exposure. */
-#define HAS_SENTINEL (HAS_WEIGHTS && !HAS_EXPOSURE_MAP)
-
 /* w (g / m - 1) and the data term of the objective; g < 0: not observed, w = 0. The guard: m counts
  * as MIN_MODEL where it is less, and g / m as 0 there, as the light that it wants is nowhere.
  * A transform's rounding is a share of what it is given: of g / m - 1, the noise, it is less than of
  * g / m, which is about 1 everywhere.
  */
-INLINE vec ratio(vec g, const vec m, vec *term)
+INLINE vec ratio(const vec g, const vec m, vec *term)
 {
-#if HAS_SENTINEL
-    const ivec observed = g >= 0;
-    g = observed ? g : (vec)0;
-#endif
-    const ivec dark = m <= (real)MIN_MODEL; /* which NaN is not: it reaches the objective */
+    const ivec hidden = g < 0;              /* which NaN is not: it reaches the objective */
+    const ivec dark = m <= (real)MIN_MODEL; /* nor this */
     const vec modelled = dark ? (vec)(real)MIN_MODEL : m;
     const vec quotient = g / modelled;
     const vec r = dark ? (vec)0 : quotient;
-    *term = divergence(modelled, quotient);
-#if HAS_SENTINEL
-    *term = observed ? *term : (vec)0;
-    return observed ? r - 1 : (vec)0;
-#else
-    return r - 1;
-#endif
+    const vec apart = divergence(modelled, quotient);
+    *term = hidden ? (vec)0 : apart;
+    return hidden ? (vec)0 : r - 1;
 }
 
 /* Sums of the OVERSAMPLE frequencies that are one in an image, neighbours in reversed order. */
@@ -102,10 +92,11 @@ INLINE SCRATCH vec *fold_rows(SCRATCH vec *z)
 /* z <- r_j - w_j, from A_j f in a block of rows of an image; ratio_sums and star_sums of the block. */
 INLINE void compare(
     SCRATCH vec *z, __global real *ratio_sums, __global real *star_sums, __global const vec *images,
-    __global const real *background, __global const vec *exposure, __global const vec *star_images,
-    __global const int *star_corners, __global const int *star_near,
-    __global const real *star_fluxes, const int n_images, const int star_blocks,
-    const int star_columns, const int block, const int image, __local real_sum *shared)
+    __global const vec *background, const int has_background_map, __global const vec *exposure,
+    const int has_exposure_map, __global const vec *star_images, __global const int *star_corners,
+    __global const int *star_near, __global const real *star_fluxes, const int n_images,
+    const int star_blocks, const int star_columns, const int block, const int image,
+    __local real_sum *shared)
 {
     const size_t at = (size_t)image * IMAGE_SIZE + (size_t)block * IMAGE_NX * 2 * SIDE;
     const int unit = image * IMAGE_ROW_BLOCKS + block;
@@ -123,24 +114,19 @@ INLINE void compare(
         }
         BARRIER;
     }
+    background += has_background_map ? at : image * 2 * SIDE;
+    exposure += has_exposure_map * at;
     vec_sum objective = {0, 0};
     FOR_EACH(piece, IMAGE_NX * SIDE) {
         const int pixel = piece / SIDE, lane = piece % SIDE;
         const cvec g = LOAD(images + at + lane, pixel);
-        cvec a = LOAD(z + lane, pixel), term;
-#if HAS_BACKGROUND_MAP
-        a = add(a, LOAD((__global const vec *)background + at + lane, pixel));
-#else
-        a.re += background[image];
-        a.im += background[image];
-#endif
+        const cvec b = LOAD_MAP(background + lane, has_background_map, pixel);
+        const cvec w = LOAD_MAP(exposure + lane, has_exposure_map, pixel);
+        cvec a = add(LOAD(z + lane, pixel), b), term;
         a.re = ratio(g.re, a.re, &term.re);
         a.im = ratio(g.im, a.im, &term.im);
-#if HAS_EXPOSURE_MAP
-        const cvec w = LOAD(exposure + at + lane, pixel);
         a = (cvec){a.re * w.re, a.im * w.im};
         term = (cvec){term.re * w.re, term.im * w.im};
-#endif
         ACCUMULATE(objective, term.re + term.im);
         STORE(z + lane, pixel, a);
     }
@@ -155,9 +141,9 @@ INLINE void compare(
 /* m_j = A_j f + sum_s c_s P_js + b_j;  r_j = w_j g_j / m_j;  spectra <- row spectra of r_j - w_j;
  * ratio_sums: J_0 = sum w_j (g_j ln(g_j / m_j) + m_j - g_j); star_sums: <P_js, r_j - w_j>.
  * spectra: n_images arrays, in: row spectra of A_j f, out: twice the row spectra of r_j - w_j.
- * images: n_images arrays of pixels, negative where not observed (HAS_WEIGHTS).
- * background: [n_images], or n_images arrays of pixels (HAS_BACKGROUND_MAP).
- * exposure: n_images arrays of pixels, w (HAS_EXPOSURE_MAP; then no image is negative).
+ * images: n_images arrays of pixels, negative where not observed.
+ * background: n_images arrays of pixels (has_background_map), or of one point, [2][BLOCK].
+ * exposure: n_images arrays of pixels, w (has_exposure_map), or one point, [2][BLOCK], for all.
  * star_images: [n_stars][n_images], a window of star_blocks blocks and star_columns columns each;
  * star_corners: [n_stars][n_images][2]; star_near: the stars of each block, see stars.cl.
  * star_fluxes: [n_stars].
@@ -170,7 +156,8 @@ INLINE void compare(
 KERNEL void ratio_rows(
     __global vec *restrict spectra, __global real *restrict ratio_sums,
     __global real *restrict star_sums, __global const vec *restrict images,
-    __global const real *restrict background, __global const vec *restrict exposure,
+    __global const vec *restrict background, const int has_background_map,
+    __global const vec *restrict exposure, const int has_exposure_map,
     __global const vec *restrict star_images, __global const int *restrict star_corners,
     __global const int *restrict star_near, __global const real *restrict star_fluxes,
     __global const real *restrict steps, const int n_images, const int star_blocks,
@@ -187,8 +174,9 @@ KERNEL void ratio_rows(
         dit_inner(z, IMAGE_NX, image_row_roots);
         finish_rows(z, IMAGE_NX, image_row_roots);
         compare(
-            z, ratio_sums, star_sums, images, background, exposure, star_images, star_corners,
-            star_near, star_fluxes, n_images, star_blocks, star_columns, block, image, shared);
+            z, ratio_sums, star_sums, images, background, has_background_map, exposure,
+            has_exposure_map, star_images, star_corners, star_near, star_fluxes, n_images,
+            star_blocks, star_columns, block, image, shared);
         begin_rows(z, IMAGE_NX, image_row_roots);
         dif_inner(z, IMAGE_NX, image_row_roots);
         write_tiles(row_spectra, z, block, OVERSAMPLE);

@@ -5,23 +5,12 @@ INLINE vec not_below_0(const vec x)
     return x < 0 ? (vec)0 : x;
 }
 
-/* a = 1 / sum_j A_j^T w_j of a point. */
-INLINE cvec inverse_weight_at(
-    __global const vec *inverse_weight, const int pixel, const int n_images)
-{
-#if HAS_WEIGHTS
-    return LOAD(inverse_weight, pixel);
-#else
-    return (cvec){(real)1 / n_images, (real)1 / n_images};
-#endif
-}
-
 /* Scales the points x, x + INNER(NX), ... of a line, whose corrections c a[] has, in place; their sum of
  * f^2. It is called with a literal is_smoothed, and mu 0: branches in the loop would leave a[] in memory.
  */
 INLINE vec scale_points(
     cvec *a, __global vec *extended, __global const vec *inverse_weight, __global const vec *slope,
-    __global const vec *curvature, const int x, const int n_images, const int is_smoothed,
+    __global const vec *curvature, const int x, const int has_weights, const int is_smoothed,
     const real mu)
 {
     vec squares = 0;
@@ -29,7 +18,7 @@ INLINE vec scale_points(
     for (int q = 0; q < OUTER(NX); ++q) {
         const int pixel = q * INNER(NX) + x;
         const cvec f = LOAD(extended, pixel);
-        const cvec weight = inverse_weight_at(inverse_weight, pixel, n_images);
+        const cvec weight = LOAD_MAP(inverse_weight, has_weights, pixel);
         const cvec curved = smoothing_at(curvature, pixel, is_smoothed);
         const cvec down = smoothing_at(slope, pixel, is_smoothed);
         a[q].re += curved.re * f.re - down.re;
@@ -51,8 +40,8 @@ INLINE vec scale_points(
  * spectra <- row spectrum of the new f; square_sums: sum f^2; the stars, with p_s = star_weights_s:
  * c_s <- c_s (p_s star_corrections_s + q_s c0_s) / (p_s + q_s c_s), by the prior (c0_s, q_s).
  * spectra: one array, in: row spectrum of c, out: twice the row spectrum of f.
- * extended: one array of pixels, f. inverse_weight: one array of pixels, a (HAS_WEIGHTS; else
- * a = 1 / n_images). slope, curvature: one array of pixels each, const, those of f
+ * extended: one array of pixels, f. inverse_weight: one array of pixels, a (has_weights), or
+ * one point, [2][BLOCK], for all. slope, curvature: one array of pixels each, const, those of f
  * (is_smoothed; else they count as 0). square_sums: [ROW_BLOCKS][2].
  * star_fluxes, star_corrections, star_weights, prior_fluxes, prior_precision: [n_stars].
  * steps[GOING] 0: nothing.
@@ -65,7 +54,7 @@ KERNEL void scale_rows(
     __global const real *restrict star_weights, __global const real *restrict prior_fluxes,
     __global const real *restrict prior_precision, __global const vec *restrict slope,
     __global const vec *restrict curvature, __global const real *restrict steps,
-    const int is_smoothed, const real mu, const int n_images, const int n_stars,
+    const int has_weights, const int is_smoothed, const real mu, const int n_stars,
     __global const real *restrict row_roots, SCRATCH vec *restrict scratch)
 {
     SHARED_SUMS(shared);
@@ -81,15 +70,15 @@ KERNEL void scale_rows(
             vec squares;
             load_inverse(a, z + lane, x, NX, row_roots);
             __global vec *source = extended + at + lane;
-            __global const vec *weight = inverse_weight + at + lane;
+            __global const vec *weight = inverse_weight + has_weights * at + lane;
             __global const vec *down = slope + at + lane, *curved = curvature + at + lane;
             /* A pass of its own over the pixels takes longer here. */
             if (is_smoothed)
-                squares = scale_points(a, source, weight, down, curved, x, n_images, 1, mu);
+                squares = scale_points(a, source, weight, down, curved, x, has_weights, 1, mu);
             else if (mu != 0)
-                squares = scale_points(a, source, weight, down, curved, x, n_images, 0, mu);
+                squares = scale_points(a, source, weight, down, curved, x, has_weights, 0, mu);
             else
-                squares = scale_points(a, source, weight, down, curved, x, n_images, 0, 0);
+                squares = scale_points(a, source, weight, down, curved, x, has_weights, 0, 0);
             ACCUMULATE(total, squares);
             store_forward(z + lane, a, x, NX, row_roots);
         }

@@ -15,12 +15,12 @@ INLINE vec shifted_scaling(
  */
 INLINE cvec scaling_at(
     const cvec f, __global const vec *shift, __global const vec *inverse_weight,
-    __global const vec *curvature, const size_t from, const int pixel, const int is_smoothed,
-    const real mu, const int n_images)
+    __global const vec *curvature, const size_t at, const int lane, const int pixel,
+    const int has_weights, const int is_smoothed, const real mu)
 {
-    const cvec z = LOAD(shift + from, pixel);
-    const cvec weight = inverse_weight_at(inverse_weight + from, pixel, n_images);
-    const cvec curved = smoothing_at(curvature + from, pixel, is_smoothed);
+    const cvec z = LOAD(shift + at + lane, pixel);
+    const cvec weight = LOAD_MAP(inverse_weight + has_weights * at + lane, has_weights, pixel);
+    const cvec curved = smoothing_at(curvature + at + lane, pixel, is_smoothed);
     return (cvec){
         shifted_scaling(f.re, z.re, weight.re, curved.re, is_smoothed, mu),
         shifted_scaling(f.im, z.im, weight.im, curved.im, is_smoothed, mu)
@@ -31,8 +31,8 @@ INLINE cvec scaling_at(
  * change_sums: <D y, s> and <D y, D y>, y = gradient' - gradient, s = f - previous,
  * D = (f + shift) a / (1 + (mu + curvature) (f + shift) a), a = 1 / sum_j A_j^T w_j.
  * spectra: one array, const, row spectrum of c. gradient: one array of pixels, updated. extended
- * (f), previous, shift: one each, const. inverse_weight: one array of pixels, a (HAS_WEIGHTS; else
- * a = 1 / n_images). slope, curvature: one array of pixels each, const, those of f (is_smoothed;
+ * (f), previous, shift: one each, const. inverse_weight: one array of pixels, a (has_weights), or
+ * one point, [2][BLOCK], for all. slope, curvature: one array of pixels each, const, those of f (is_smoothed;
  * else they count as 0). change_sums: [2][ROW_BLOCKS][2]. steps[FRESH] 0: nothing.
  * Launch: up to ROW_BLOCKS groups. In place. Scratch: NX points. Twin: reference.gradient_rows.
  */
@@ -42,7 +42,7 @@ KERNEL void gradient_rows(
     __global const vec *restrict previous, __global const vec *restrict shift,
     __global const vec *restrict inverse_weight, __global const vec *restrict slope,
     __global const vec *restrict curvature, __global const real *restrict steps,
-    const int is_smoothed, const real mu, const int n_images,
+    const int has_weights, const int is_smoothed, const real mu,
     __global const real *restrict row_roots, SCRATCH vec *restrict scratch)
 {
     SHARED_SUMS(shared);
@@ -61,7 +61,7 @@ KERNEL void gradient_rows(
             const cvec g = LOAD(gradient + at + lane, pixel);
             const cvec down = smoothing_at(slope + at + lane, pixel, is_smoothed);
             const cvec d = scaling_at(
-                f, shift, inverse_weight, curvature, at + lane, pixel, is_smoothed, mu, n_images);
+                f, shift, inverse_weight, curvature, at, lane, pixel, has_weights, is_smoothed, mu);
             const cvec next = {mu * f.re + down.re - a.re, mu * f.im + down.im - a.im};
             const cvec change = {d.re * (next.re - g.re), d.im * (next.im - g.im)};
             ACCUMULATE(
@@ -97,8 +97,8 @@ KERNEL void step_rows(
     __global const vec *restrict inverse_weight, __global const vec *restrict curvature,
     __global const vec *restrict cross_information, __global const int *restrict cross_corners,
     __global const int *restrict cross_near, __global const real *restrict steps,
-    __global const real *restrict change_sums, const int is_smoothed, const real mu,
-    const int n_images, const int cross_blocks, const int cross_columns,
+    __global const real *restrict change_sums, const int has_weights, const int is_smoothed,
+    const real mu, const int cross_blocks, const int cross_columns,
     __global const real *restrict row_roots, SCRATCH vec *restrict scratch)
 {
     SHARED_SUMS(shared);
@@ -117,7 +117,7 @@ KERNEL void step_rows(
             const cvec f = LOAD(extended + at + lane, pixel);
             const cvec g = LOAD(gradient + at + lane, pixel);
             const cvec scale = scaling_at(
-                f, shift, inverse_weight, curvature, at + lane, pixel, is_smoothed, mu, n_images);
+                f, shift, inverse_weight, curvature, at, lane, pixel, has_weights, is_smoothed, mu);
             const cvec trial = {
                 not_below_0(f.re - alpha * scale.re * g.re),
                 not_below_0(f.im - alpha * scale.im * g.im)

@@ -167,12 +167,12 @@ KERNEL void ratio_sheared(
     __global const int *restrict column_shifts, __global const real *restrict column_weights,
     __global const vec *restrict image_weights, const int image, const int count,
     const int image_blocks, __global real *restrict ratio_sums, __global real *restrict star_sums,
-    __global const vec *restrict images, __global const real *restrict background,
-    __global const vec *restrict exposure, __global const vec *restrict star_images,
-    __global const int *restrict star_corners, __global const int *restrict star_near,
-    __global const real *restrict star_fluxes, __global const real *restrict steps,
-    const int n_images, const int star_blocks, const int star_columns,
-    SCRATCH vec *restrict scratch)
+    __global const vec *restrict images, __global const vec *restrict background,
+    const int has_background_map, __global const vec *restrict exposure, const int has_exposure_map,
+    __global const vec *restrict star_images, __global const int *restrict star_corners,
+    __global const int *restrict star_near, __global const real *restrict star_fluxes,
+    __global const real *restrict steps, const int n_images, const int star_blocks,
+    const int star_columns, SCRATCH vec *restrict scratch)
 {
     SHARED_SUMS(shared);
     SCRATCH vec *sheared = OWN_SCRATCH(scratch, 2 * TURN_POINTS);
@@ -201,8 +201,9 @@ KERNEL void ratio_sheared(
         }
         BARRIER;
         compare(
-            z, ratio_sums, star_sums, images, background, exposure, star_images, star_corners,
-            star_near, star_fluxes, n_images, star_blocks, star_columns, block, turn, shared);
+            z, ratio_sums, star_sums, images, background, has_background_map, exposure,
+            has_exposure_map, star_images, star_corners, star_near, star_fluxes, n_images,
+            star_blocks, star_columns, block, turn, shared);
         FOR_EACH(i, TURN_MARGIN * 2 * SIDE) {
             wide[i] = z[i + (NX - TURN_MARGIN) * 2 * SIDE];
             z[i + NX * 2 * SIDE] = z[i];

@@ -163,7 +163,7 @@ def record_launches():
     genuine = launch.Launch.__call__
 
     def recorded(self):
-        launched.add(self._kernel.function_name)
+        launched.add(self._name)
         return genuine(self)
 
     launch.Launch.__call__ = recorded

@@ -94,9 +94,11 @@ def _launch(
 
 
 def _put(harness: KernelHarness, name: str, values: Any) -> cl.Buffer | float | None:
-    """Return an input for a kernel: a number, pixels, or a number for each star."""
+    """Return an input for a kernel: a number, pixels, their one value, or one for each star."""
     if name in NUMBERS:
         return float(values)
+    if isinstance(values, float):
+        return harness.put_points(values)
     if isinstance(values, np.ndarray):
         return harness.put(values) if values.ndim == 1 else harness.put_pixels(values)
     return None  # the scene has none
@@ -246,12 +248,12 @@ def _run_ratio_rows(harness: KernelHarness, given: SimpleNamespace) -> Pairs:
 
 def _put_observed(harness: KernelHarness, given: SimpleNamespace) -> dict[str, Any]:
     """Return all that models are compared with, stars, and room for the sums."""
-    images, exposure = given.images, {}
+    images, exposure = given.images, harness.put_points(1.0)
     if given.has_exposure_map:
-        exposure = {"exposure": harness.put_pixels(given.weights)}
+        exposure = harness.put_pixels(given.weights)
     elif given.weights is not None:
         images = np.where(given.weights, given.images, -1.0)
-    put = harness.put_pixels if given.background.size > given.p else harness.put
+    put = harness.put_pixels if given.background.size > given.p else harness.put_points
     n_sums = given.p * given.star_windows.n_blocks
     return {
         "ratio_sums": harness.put(np.full((harness.program.image_row_blocks * given.p, 2), np.nan)),
@@ -261,7 +263,7 @@ def _put_observed(harness: KernelHarness, given: SimpleNamespace) -> dict[str, A
         "star_images": harness.put_windows(given.star_images, given.star_windows),
         **_put_windows(harness, "star", given.star_windows),
         "star_fluxes": harness.put(given.star_fluxes),
-        **exposure,
+        "exposure": exposure,
     }
 
 

@@ -23,7 +23,8 @@ from lnocl.core.scene.steps import Steps
 from lnocl.errors import DeviceError
 
 # What of a scene kernels are told as they are launched; with all else they are built.
-ARGUMENTS = "n_images", "n_stars", "has_mu", "has_smoothing", "has_smoothing_map"
+MAPS = "has_weights", "has_background_map", "has_exposure_map", "has_smoothing_map"
+ARGUMENTS = "n_images", "n_stars", "has_mu", "has_smoothing", *MAPS
 # Scenes with all parts, together, that a program can have.
 THREE_IMAGES = "three images, two stars, mask, background map, map of smoothing"
 TWICE_AS_FINE = "sky twice as fine, three images, two stars, mask, background map"
@@ -207,7 +208,7 @@ class KernelHarness:
         counts = {"n_images": self.n_images, "n_stars": self.n_stars, "first": 0}
         counts |= {
             "is_smoothed": int(self.scene.get("has_smoothing", False)),
-            "has_smoothing_map": int(self.scene.get("has_smoothing_map", False)),
+            **{name: int(self.scene.get(name, False)) for name in MAPS},
         }
         given = {**counts, "steps": self.put(Steps().numbers()), **arguments}
         for name in self.program.arguments[kernel]:
@@ -227,6 +228,10 @@ class KernelHarness:
     def put_pixels(self, pixels: Iterable[NDArray]) -> cl.Buffer:
         """Return a buffer of arrays of pixels, in the kernels' order."""
         return self.put([self.layout.pack_pixels(a) for a in pixels])
+
+    def put_points(self, values: ArrayLike) -> cl.Buffer:
+        """Return a buffer of values, each as a point that holds for all pixels."""
+        return self.put(np.repeat(values, 2 * self.program.tuning.block))
 
     def put_spectra(self, row_spectra: Iterable[NDArray]) -> cl.Buffer:
         """Return a buffer of row spectra, in the kernels' order."""

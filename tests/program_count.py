@@ -1,24 +1,28 @@
 """Counts the OpenCL programs that the fast tests build, and names the test that builds each.
 
-A program takes seconds to compile. A test that needs another one should first look for a scene
-whose program other tests build already, as `scenes` and `kernel_cases` have them.
+A program, a part of the kernels, takes up to two seconds to compile. A test that needs another one
+should first look for a scene whose programs other tests build already, as `scenes` and
+`kernel_cases` have them.
 """
 
 import os
+import weakref
 
 import pytest
 
 from lnocl.core.opencl import program
 
-MAX_PROGRAMS = 16
+MAX_PROGRAMS = 32
 FAST = "not exhaustive and not system"
 
 built = {}  # the test that built each program first
+held = weakref.WeakSet()
 
 
 class CountedProgram(program._Built):
     def __init__(self, context, text, options, file):
         super().__init__(context, text, options, file)
+        held.add(self)
         built.setdefault(file.name, os.environ.get("PYTEST_CURRENT_TEST", "a fixture"))
 
 
@@ -31,7 +35,7 @@ def pytest_testnodedown(node):
 
 
 def pytest_sessionfinish(session):
-    for each in program._programs.values():
+    for each in held:
         each.store()  # workers end without what other processes do at their exit
     if hasattr(session.config, "workeroutput"):
         session.config.workeroutput["programs"] = built

@@ -2,7 +2,6 @@
 
 import re
 import resource
-from collections import OrderedDict
 from pathlib import Path
 
 import numpy as np
@@ -126,7 +125,7 @@ def test_a_device_lost_while_the_host_waits(monkeypatch):
     assert "clWaitForEvents failed: EXEC_STATUS_ERROR_FOR_EVENTS_IN_WAIT_LIST" in refused()
     monkeypatch.undo()
     assert device.context_of(device.choose().device) is not lost
-    assert not program._programs
+    assert not program._build.cache_info().currsize
     paper(observe(), n_iter=1)
 
 
@@ -142,7 +141,8 @@ def test_every_public_verb_of_the_engine_is_guarded():
 
 
 def test_a_compiler_that_fails_leaves_its_whole_log(monkeypatch, tmp_path):
-    monkeypatch.setattr(program, "source", lambda: "this is no OpenCL;\nnor this")
+    text = program.source()
+    monkeypatch.setattr(program, "source", lambda: f"{text}this is no OpenCL;\nnor this")
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     message = refused()
     (log,) = tmp_path.glob("lnocl-build-*.log")
@@ -155,7 +155,8 @@ def test_a_compiler_that_fails_leaves_its_whole_log(monkeypatch, tmp_path):
 
 @on_pocl  # with others, PyOpenCL needs a folder for temporary files first
 def test_a_log_that_cannot_be_saved_is_no_other_error(monkeypatch):
-    monkeypatch.setattr(program, "source", lambda: "this is no OpenCL")
+    text = program.source()
+    monkeypatch.setattr(program, "source", lambda: f"{text}this is no OpenCL")
     device.choose()  # has made its folder
     monkeypatch.setattr("tempfile.tempdir", "/nonexistent")
     assert "could not be saved" in refused()
@@ -164,7 +165,7 @@ def test_a_log_that_cannot_be_saved_is_no_other_error(monkeypatch):
 @on_pocl
 def test_too_few_addresses_are_refused_before_pocl_compiles(monkeypatch):
     """It fails while it holds locks that it then waits for, as the process ends."""
-    monkeypatch.setattr(program, "_programs", OrderedDict())
+    program._build.cache_clear()
     before = resource.getrlimit(resource.RLIMIT_AS)
     used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
     resource.setrlimit(resource.RLIMIT_AS, (used + 400 * 2**20, before[1]))

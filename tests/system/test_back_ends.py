@@ -8,7 +8,6 @@ import re
 import shutil
 import subprocess
 from glob import glob
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -43,10 +42,8 @@ CASES = {
 MAX_REGISTERS = {np.float32: 128, np.float64: 256}
 
 
-def options(monkeypatch, grid, scene, dtype):
+def options(grid, scene, dtype):
     """Return the options with which a program for a GPU is built."""
-    built = SimpleNamespace(kernel_names=[], store=lambda: None, take_back=lambda _: None)
-    monkeypatch.setattr(program, "_build", lambda *_: built)
     parts = {k: v for k, v in SCENES[scene].items() if k not in ARGUMENTS}
     oversample = parts.get("oversample", 1)
     cut = of_gpu(*grid, oversample=oversample, dtype=dtype)
@@ -80,8 +77,8 @@ RUNS = pytest.mark.parametrize("dtype", [np.float32, np.float64], ids=["single",
 
 @RUNS
 @pytest.mark.parametrize("case", CASES)
-def test_work_items_of_amd_have_registers_alone(monkeypatch, tmp_path, case, dtype):
-    assembly = compiled("AMD", options(monkeypatch, *CASES[case], dtype), tmp_path)
+def test_work_items_of_amd_have_registers_alone(tmp_path, case, dtype):
+    assembly = compiled("AMD", options(*CASES[case], dtype), tmp_path)
     kernels = re.findall(
         r"\.name: +(\w+)\n.*?private_segment_fixed_size: (\d+).*?"
         r"\.vgpr_count: +(\d+)\n +\.vgpr_spill_count: (\d+)",
@@ -97,8 +94,8 @@ def test_work_items_of_amd_have_registers_alone(monkeypatch, tmp_path, case, dty
 
 @RUNS
 @pytest.mark.parametrize("case", CASES)
-def test_work_items_of_nvidia_have_registers_alone(monkeypatch, tmp_path, case, dtype):
-    assembly = compiled("NVIDIA", options(monkeypatch, *CASES[case], dtype), tmp_path)
+def test_work_items_of_nvidia_have_registers_alone(tmp_path, case, dtype):
+    assembly = compiled("NVIDIA", options(*CASES[case], dtype), tmp_path)
     assert len(re.findall(r"\.entry (\w+)", assembly)) >= 12
     assert not re.findall(r"__local_depot|\bld\.local|\bst\.local", assembly)
 
@@ -106,8 +103,8 @@ def test_work_items_of_nvidia_have_registers_alone(monkeypatch, tmp_path, case, 
 @RUNS
 @pytest.mark.parametrize("case", CASES)
 @pytest.mark.skipif(PTXAS is None, reason="no ptxas here: it comes with NVIDIA's CUDA")
-def test_nvidia_assembles_them_without_spilling(monkeypatch, tmp_path, case, dtype):
-    compiled("NVIDIA", options(monkeypatch, *CASES[case], dtype), tmp_path)
+def test_nvidia_assembles_them_without_spilling(tmp_path, case, dtype):
+    compiled("NVIDIA", options(*CASES[case], dtype), tmp_path)
     done = subprocess.run(
         [PTXAS, "-arch=sm_90", "-v", "-o", "kernels.o", "kernels.s"],
         cwd=tmp_path,

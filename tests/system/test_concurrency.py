@@ -164,5 +164,5 @@ def test_two_processes_on_a_cold_kernel_cache_are_right(attempt, tmp_path):
     assert [process.returncode for process in processes] == [0, 0], said
     assert said[0] == said[1]
     assert not said[0][1]
-    (kept,) = (tmp_path / "pocl").glob("*.kernels")  # one file, whichever came last
-    assert kept.suffix == ".kernels"
+    # One file a program, whichever came last: of kernels that are needed first, and last.
+    assert len(list((tmp_path / "pocl").glob("*.kernels"))) == 2

@@ -15,6 +15,8 @@ from lnocl.core.scene.steps import Steps
 from lnocl.core.solvers.scaling import Scaling
 
 N_STEPS = len(Steps().numbers())
+# Buffers of a number a star.
+OF_STARS = "star_fluxes", "star_weights", "star_corrections", "prior_fluxes", "prior_precision"
 # Bytes, half of those that PoCL's compiler takes in a first run: later ones find its kernels.
 COMPILER = 40 * 2**20
 # Estimates of both halves of the counts that are held (`lnocl.core.runs.halves`).
@@ -27,21 +29,20 @@ def buffer_sizes(
     """Return the bytes of each buffer, by the name that the kernels have for it."""
     p, n, item = scene.n_images, scene.n_fluxes, program.dtype.itemsize
     pixels, image, pair = layout.pixels_bytes, layout.images.pixels_bytes, 2 * item
+    point = layout.block_bytes // program.grid[1]
     return {
         "images": p * image,
         "otfs": p * pixels,
         "otf_edges": p * program.grid[0] * pair,
         "spectra": p * layout.spectra_bytes,
         "extended": pixels,
-        "inverse_weight": pixels if scene.weights is not None else item,
-        "background": p * (image if has_background_map(scene) else item),
-        "exposure": p * image if scene.has_exposure_map else item,
+        "inverse_weight": pixels if scene.weights is not None else point,
+        "background": p * (image if has_background_map(scene) else point),
+        "exposure": p * image if scene.has_exposure_map else point,
         "star_images": max(p * stars.bytes, item),
         "star_corners": max(n * p, 1) * 8,
         "star_near": stars.near.nbytes,
-        "star_fluxes": max(n, 1) * item,
-        "star_weights": max(n, 1) * item,
-        "star_corrections": max(n, 1) * item,
+        **dict.fromkeys(OF_STARS, max(n, 1) * item),
         "star_totals": max(n, 1) * pair,
         "star_sums": max(p * stars.n_blocks_of_all, 1) * pair,
         "ratio_sums": program.image_row_blocks * p * pair,
@@ -53,8 +54,6 @@ def buffer_sizes(
         "smooth_sums": program.row_blocks * pair,
         "objectives": (n_iter + 1) * pair,
         "steps": N_STEPS * item,
-        "prior_fluxes": max(n, 1) * item,
-        "prior_precision": max(n, 1) * item,
         "row_phases": item,
         "transmission": p * pixels if scene.transmission is not None else item,
         "transmitted": pixels if scene.transmission is not None else item,

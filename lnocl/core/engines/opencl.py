@@ -97,15 +97,13 @@ class OpenCLEngine:
             np.dtype(np.float64 if precision == "double" else np.float32),
             tuning,
             oversample=1 if scene.rotations else scene.oversample,
-            has_weights=scene.weights is not None,
-            has_exposure_map=scene.has_exposure_map,
-            has_background_map=has_background_map(scene),
             has_turns=bool(scene.rotations),
             min_model=MIN_MODEL,
         )
         self._first = Steps(rounding=ROUNDING) if precision == "single" else Steps()
         self.layout = Layout(self.program)
-        self._turned = self._turned_images()
+        turned = scene.rotations, self.program, self.layout
+        self._turned = TurnedImages(*turned) if scene.rotations else None
         self._stars = StarWindows(
             self.layout.images,
             [[scene.star_box(j, s) for j in range(scene.n_images)] for s in range(scene.n_fluxes)],
@@ -144,20 +142,10 @@ class OpenCLEngine:
         if scaling is not None:
             self._upload_scaling(scaling)
 
-    def _turned_images(self) -> TurnedImages | None:
-        rotations = self.scene.rotations
-        return TurnedImages(rotations, self.program, self.layout) if rotations else None
-
     @property
     def _spacing(self) -> int:
         """Pixels of an image here to one of the scene's: turned images lie on pixels of the sky."""
         return self.program.image_grid[0] // self.scene.image_grid[0]
-
-    @property
-    def _observed_blocks(self) -> int:
-        """Blocks of row pairs of the images' grid that hold rows of the images."""
-        rows = self._spacing * self.scene.observation.shape[0]
-        return -(-rows // (2 * self.program.tuning.block))
 
     def _cross_windows(self) -> StarWindows:
         cutouts = self.scaling.cross_information if self.scaling is not None else []
@@ -166,7 +154,7 @@ class OpenCLEngine:
         )
 
     def _bind(self, name: str, **others: object) -> Launch:
-        scene = self.scene
+        scene, rows = self.scene, self._spacing * self.scene.observation.shape[0]
         numbers = {
             "n_images": scene.n_images,
             "n_stars": scene.n_fluxes,
@@ -174,6 +162,9 @@ class OpenCLEngine:
             "star_columns": self._stars.n_columns,
             "cross_blocks": self._cross.n_blocks,
             "cross_columns": self._cross.n_columns,
+            "has_weights": int(scene.weights is not None),
+            "has_background_map": int(has_background_map(scene)),
+            "has_exposure_map": int(scene.has_exposure_map),
             "mu": scene.mu,
             "is_smoothed": int(scene.is_smoothed),
             "has_smoothing_map": int(scene.smoothing_map is not None),
@@ -181,7 +172,7 @@ class OpenCLEngine:
             "edge": scene.edge,
             "image": 0,
             "first": 0,
-            "image_blocks": self._observed_blocks,
+            "image_blocks": -(-rows // (2 * self.program.tuning.block)),  # that hold some of these
         }
         return self._launcher.bind(name, {**self._memory.buffers, **numbers}, **others)
 
@@ -209,13 +200,9 @@ class OpenCLEngine:
             self._turned.upload(memory)
         memory.clear("star_sums")  # in images that do not show a star they stay 0
         self.take_images()
-        if scene.weights is not None and scene.has_exposure_map:
-            memory.upload_pixels("exposure", self._laid(scene.weights, 0.0))
-        background = scene.background()
-        if background.ndim == 3:
-            memory.upload_pixels("background", self._laid(background, 1.0))
-        else:
-            memory.upload("background", background)
+        has_map = scene.weights is not None and scene.has_exposure_map
+        self._upload_map("exposure", np.asarray(scene.weights if has_map else [1.0]), 0.0)
+        self._upload_map("background", scene.background(), 1.0)
         if scene.smoothing_map is not None:
             memory.upload_pixels("smoothing_map", [scene.smoothing_map])
         if scene.transmission is not None:
@@ -224,8 +211,17 @@ class OpenCLEngine:
         memory.upload_integers("star_corners", self._stars.corners)
         memory.upload_integers("star_near", self._stars.near)
         self.move_stars()
-        if scene.weights is not None:
+        if scene.weights is None:
+            memory.upload_points("inverse_weight", np.array([1.0 / scene.n_images]))
+        else:
             self._invert(self._total_weight(scene.weights))
+
+    def _upload_map(self, name: str, values: Array, beside: float) -> None:
+        """Copy images to a buffer, or a value for each."""
+        if values.ndim == 3:
+            self._memory.upload_pixels(name, self._laid(values, beside))
+        else:
+            self._memory.upload_points(name, values)
 
     def _laid(self, images: Iterable[Array], beside: float) -> Iterable[Array]:
         """Return images as they lie on the device, with a value beside their pixels."""
@@ -234,15 +230,14 @@ class OpenCLEngine:
 
     def take_images(self) -> None:
         """Take the images that the scene has now, all else being as it was."""
-        beside = 0.0 if self.scene.has_exposure_map else UNSEEN
-        self._memory.upload_pixels("images", self._laid(self._marked_images(), beside))
+        self._memory.upload_pixels("images", self._laid(self._marked_images(), UNSEEN))
 
     def _marked_images(self) -> Iterator[Array]:
-        """Yield the images; `UNSEEN` is not observed, unless a map of exposures marks that."""
-        weights = None if self.scene.has_exposure_map else self.scene.weights
+        """Yield the images, with `UNSEEN` where they were not observed."""
+        weights = self.scene.weights
         for j, image in enumerate(self.scene.images()):
             if weights is not None:
-                image[~weights[j]] = UNSEEN
+                image[weights[j] == 0] = UNSEEN
             yield image
 
     def set_scaling(self, scaling: Scaling) -> None:
@@ -385,7 +380,7 @@ class OpenCLEngine:
 
     def extended(self) -> NDArray[np.floating]:
         """Return the extended source, on the grid and scaled, in the precision of the device."""
-        return self._memory.download_pixels("extended")
+        return self.layout.unpack_pixels(self._memory.download_raw("extended"))
 
     def star_fluxes(self) -> Array:
         """Return the star fluxes, scaled."""

@@ -84,29 +84,29 @@ class Launch:
         arguments: Mapping[str, Any],
         groups: int,
     ) -> None:
-        # The program has the kernel for as long as it is held.
-        self._queue, self._program, self._kernel = queue, program, program.kernel(name)
-        self._real = program.dtype.type
-        self._index = {each: index for index, each in enumerate(program.arguments[name])}
+        self._queue, self._program, self._name = queue, program, name
+        self._types, self._real = program.arguments[name], program.dtype.type
+        self._index = {each: index for index, each in enumerate(self._types)}
         group = program.tuning.group
         self._global_size, self._local_size = (groups * group,), (group,)
-        self.set(**{each: arguments[each] for each in self._index})
+        self._new: dict[int, Any] = {}
+        self.set(**{each: arguments[each] for each in self._types})
 
     def set(self, **arguments: Any) -> None:
         """Give some arguments other values."""
         for name, value in arguments.items():
-            if isinstance(value, int):
-                value = np.int32(value)
-            elif isinstance(value, float):
-                value = self._real(value)
-            # Not set_args, which writes Python for each kernel and stores it in a cache on disk.
-            self._kernel.set_arg(self._index[name], value)
+            kind = self._types[name]
+            if "*" not in kind:
+                value = np.int32(value) if "int" in kind else self._real(value)
+            self._new[self._index[name]] = value
 
     def __call__(self) -> cl.Event:
-        """Enqueue the kernel."""
-        return cl.enqueue_nd_range_kernel(
-            self._queue, self._kernel, self._global_size, self._local_size
-        )
+        """Enqueue the kernel, which is made as it is first launched: see `ahead`."""
+        kernel = self._program.kernel(self._name)
+        while self._new:
+            # Not set_args, which writes Python for each kernel and stores it in a cache on disk.
+            kernel.set_arg(*self._new.popitem())
+        return cl.enqueue_nd_range_kernel(self._queue, kernel, self._global_size, self._local_size)
 
 
 class Launcher:
@@ -171,4 +171,6 @@ class Launcher:
             return self.program.row_blocks * int(arguments["count"])
         if name == "ratio_rows":
             return self.program.image_row_blocks * int(arguments["n_images"])
-        return self.program.column_blocks if name.endswith("_columns") else self.program.row_blocks
+        if name.endswith("_columns"):
+            return self.program.grid[1] // 2 // self.program.tuning.block
+        return self.program.row_blocks

@@ -76,6 +76,10 @@ class Memory:
         if len(values):
             cl.enqueue_copy(self._queue, self.buffers[name], values.astype(np.int32))
 
+    def upload_points(self, name: str, values: NDArray) -> None:
+        """Copy values to a buffer, each as a point that holds for all pixels."""
+        self.upload(name, np.repeat(values, self.count(name) // len(values)))
+
     def upload_pixels(self, name: str, arrays: Iterable[NDArray]) -> None:
         """Copy arrays of pixels, or of some blocks' rows, to a buffer, one behind the other."""
         offset = 0
@@ -106,10 +110,6 @@ class Memory:
         if count:
             cl.enqueue_copy(self._queue, values, self.buffers[name])
         return values.astype(np.float64)
-
-    def download_pixels(self, name: str) -> NDArray:
-        """Return the one array of pixels that a buffer holds, in the precision of the device."""
-        return self._layout.unpack_pixels(self.download_raw(name))
 
     def download_raw(self, name: str) -> NDArray:
         """Return all of a buffer as it lies on the device."""

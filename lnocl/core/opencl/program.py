@@ -5,10 +5,9 @@ from __future__ import annotations
 import math
 import mmap
 import os
-import re
 import weakref
-from collections import OrderedDict, defaultdict
-from collections.abc import Mapping
+from collections import defaultdict
+from collections.abc import Iterable
 from functools import lru_cache
 from pathlib import Path
 from typing import cast
@@ -19,7 +18,7 @@ import pyopencl as cl
 from lnocl.core.opencl import kernel_cache, trial, unknown_cpu
 from lnocl.core.opencl.device import describe, has_double
 from lnocl.core.opencl.faults import after_fault, build_failure
-from lnocl.core.opencl.sources import source
+from lnocl.core.opencl.sources import arguments, beside, source
 from lnocl.core.opencl.tuning import Tuning, odd_part, tune
 from lnocl.core.scene.line_weights import TAPS
 from lnocl.core.scene.rotation import PHASE_ROWS
@@ -32,8 +31,8 @@ GROUPS_A_UNIT = 4
 # Pairs of rows in a piece of a column, where an image is sheared.
 COLUMN_PAIRS = 64
 
-# Built programs that a process holds, the last used; each takes some 3 MiB.
-MAX_PROGRAMS = 16
+# Built programs that a process holds, the last used; each takes some MiB.
+MAX_PROGRAMS = 48
 
 # Bytes of addresses with which PoCL builds and launches kernels for sure. With too few it fails
 # while it holds its locks, and waits for them as the process ends.
@@ -71,8 +70,8 @@ class Program:
         By default that of `lnocl.core.opencl.tuning.tune`.
     oversample : int, optional
         Pixels of the sky to one of the images, along each axis: 1, 2 or 4.
-    has_weights, has_background_map, has_exposure_map, has_turns : bool, optional
-        Parts that the scene has.
+    has_turns : bool, optional
+        Whether images are turned against the sky.
     min_model : float, optional
         The division guard.
 
@@ -80,8 +79,8 @@ class Program:
     ----------
     options : list of str
         The build options.
-    arguments : dict of str to tuple of str
-        The names of each kernel's arguments, in the order of its declaration.
+    arguments : dict of str to dict of str to str
+        The types of each kernel's arguments by their names, in the order of its declaration.
     image_grid : tuple of int
         Shape of the images' grid.
     radices : dict of str to tuple of int
@@ -103,12 +102,9 @@ class Program:
         grid: tuple[int, int],
         dtype: np.dtype,
         tuning: Tuning | None = None,
-        *,
         oversample: int = 1,
-        has_weights: bool = False,
-        has_background_map: bool = False,
-        has_exposure_map: bool = False,
         has_turns: bool = False,
+        *,
         min_model: float = 0.0,
     ) -> None:
         device = context.devices[0]
@@ -147,9 +143,6 @@ class Program:
             "NY": grid[0],
             "OVERSAMPLE": oversample,
             "ROWS": self.rows,
-            "HAS_WEIGHTS": int(has_weights),
-            "HAS_BACKGROUND_MAP": int(has_background_map),
-            "HAS_EXPOSURE_MAP": int(has_exposure_map),
             "HAS_TURNS": int(has_turns),
             "TURN_TAPS": TAPS,
             "PHASE_ROWS": self.phase_rows,
@@ -158,17 +151,16 @@ class Program:
         }
         definitions = [f"-D{name}={value}" for name, value in constants.items()]
         self.options = ["-cl-std=CL1.2", "-w", *definitions]
-        text = source()
-        self._built = _build(context, text, tuple(self.options))
-        self.arguments = _arguments(text, tuple(self._built.kernel_names))
+        self.arguments = arguments(source())
         self._kernels: dict[str, cl.Kernel] = {}
-        weakref.finalize(self, self._built.store)
-        weakref.finalize(self, self._built.take_back, self._kernels)
 
     def kernel(self, name: str) -> cl.Kernel:
         """Return a kernel, always the same one."""
         if name not in self._kernels:
-            self._kernels[name] = self._built.kernel(name)
+            with LOCK:
+                built = _build(self.context, beside(name, source()), tuple(self.options))
+            self._kernels[name] = built.kernel(name)
+            weakref.finalize(self, built.take_back, name, self._kernels[name])
         return self._kernels[name]
 
     @property
@@ -180,11 +172,6 @@ class Program:
     def image_row_blocks(self) -> int:
         """Blocks of row pairs in an image."""
         return self.image_grid[0] // 2 // self.tuning.block
-
-    @property
-    def column_blocks(self) -> int:
-        """Blocks of columns in an array of spectra."""
-        return self.grid[1] // 2 // self.tuning.block
 
     @property
     def column_pairs(self) -> int:
@@ -210,15 +197,6 @@ def _has_builtin_prefetch(device: cl.Device) -> bool:
     return device.platform.name == unknown_cpu.POCL and bool(device.type & cl.device_type.CPU)
 
 
-@lru_cache(maxsize=MAX_PROGRAMS)
-def _arguments(text: str, kernel_names: tuple[str, ...]) -> Mapping[str, tuple[str, ...]]:
-    """Return the names of the arguments that the source declares for each kernel."""
-    declared = dict(re.findall(r"^KERNEL void (\w+)\(([^)]*)\)", text, re.MULTILINE))
-    return {
-        name: tuple(re.findall(r"(\w+)\s*(?:,|$)", declared[name].strip())) for name in kernel_names
-    }
-
-
 class _Built:
     """A built program, and the file that later processes have it from."""
 
@@ -235,8 +213,6 @@ class _Built:
             self._folders |= kernel_cache.folders() - before
         else:
             self.program = self._load(context, options) or _compile(context, text, options)
-        # Not by all_kernels: its kernels are retained once too often, and stay with their program.
-        self.kernel_names = str(self.program.get_info(cl.program_info.KERNEL_NAMES)).split(";")
         self.used, self._looked_at = set[str](), set[str]()
         self._idle: dict[str, list[cl.Kernel]] = defaultdict(list)
 
@@ -250,10 +226,10 @@ class _Built:
             idle = self._idle[name]
             return idle.pop() if idle else cl.Kernel(self.program, name)
 
-    def take_back(self, kernels: Mapping[str, cl.Kernel]) -> None:
-        """Have kernels that nothing launches any more for the next program."""
-        for name, kernel in kernels.items():
-            self._idle[name].append(kernel)
+    def take_back(self, name: str, kernel: cl.Kernel) -> None:
+        """Have a kernel that nothing launches any more for the next program."""
+        self._idle[name].append(kernel)
+        self.store()
 
     def _load(self, context: cl.Context, options: tuple[str, ...]) -> cl.Program | None:
         if not self._content:
@@ -287,23 +263,22 @@ class _Built:
                 self._content = content
 
 
-_programs: OrderedDict[tuple[cl.Context, str, tuple[str, ...]], _Built] = OrderedDict()
+def _file(context: cl.Context, text: str, options: Iterable[str]) -> Path:
+    """Return the file that holds a program when it is compiled."""
+    return kernel_cache.file_of("\n".join([describe(context.devices[0]), *options, text]))
 
 
+@lru_cache(MAX_PROGRAMS)
 def _build(context: cl.Context, text: str, options: tuple[str, ...]) -> _Built:
     """Return a program that the process has, that a file holds, or that is compiled now."""
-    key = context, text, options
-    with LOCK:
-        if key not in _programs:
-            _need_room(context.devices[0])
-            unknown_cpu.name_level(context.devices[0])
-            trial.check(context.devices[0])
-            name = "\n".join([describe(context.devices[0]), *options, text])
-            _programs[key] = _Built(context, text, options, kernel_cache.file_of(name))
-            while len(_programs) > MAX_PROGRAMS:
-                _programs.popitem(last=False)
-        _programs.move_to_end(key)
-        return _programs[key]
+    _need_room(context.devices[0])
+    unknown_cpu.name_level(context.devices[0])
+    trial.check(context.devices[0])
+    file = _file(context, text, options)
+    return _Built(context, text, options, file)
+
+
+after_fault(_build.cache_clear)  # the context may be lost
 
 
 def _need_room(device: cl.Device) -> None:
@@ -323,13 +298,6 @@ def _need_room(device: cl.Device) -> None:
             f"PoCL needs {ROOM // 2**20} MiB of addresses more than this process may have: raise "
             "the limit of memory (ulimit -v), or take `engine` numpy"
         ) from error
-
-
-@after_fault
-def forget_programs() -> None:
-    """Let all programs go, as after a fault of a device, whose context may be lost."""
-    with LOCK:
-        _programs.clear()
 
 
 def _compile(context: cl.Context, text: str, options: tuple[str, ...]) -> cl.Program:
