@@ -15,10 +15,10 @@ from typing import cast
 import numpy as np
 import pyopencl as cl
 
-from lnocl.core.opencl import kernel_cache, trial, unknown_cpu
+from lnocl.core.opencl import ahead, kernel_cache, trial, unknown_cpu
 from lnocl.core.opencl.device import describe, has_double
 from lnocl.core.opencl.faults import after_fault, build_failure
-from lnocl.core.opencl.sources import arguments, beside, source
+from lnocl.core.opencl.sources import LAST, arguments, beside, source
 from lnocl.core.opencl.tuning import Tuning, odd_part, tune
 from lnocl.core.scene.line_weights import TAPS
 from lnocl.core.scene.rotation import PHASE_ROWS
@@ -153,6 +153,7 @@ class Program:
         self.options = ["-cl-std=CL1.2", "-w", *definitions]
         self.arguments = arguments(source())
         self._kernels: dict[str, cl.Kernel] = {}
+        ahead.begin(_file(context, beside(LAST[0], source()), self.options), self)
 
     def kernel(self, name: str) -> cl.Kernel:
         """Return a kernel, always the same one."""
@@ -275,6 +276,7 @@ def _build(context: cl.Context, text: str, options: tuple[str, ...]) -> _Built:
     unknown_cpu.name_level(context.devices[0])
     trial.check(context.devices[0])
     file = _file(context, text, options)
+    ahead.wait(file)
     return _Built(context, text, options, file)
 
 

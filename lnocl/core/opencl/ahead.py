@@ -1,0 +1,65 @@
+"""Kernels that a process of its own compiles meanwhile: PoCL compiles one at a time in a process.
+
+Whoever needs them waits for its end, and has them from the store, as of any process before; where
+it failed they are not there, and are compiled as they would be without it.
+"""
+
+from __future__ import annotations
+
+import atexit
+import subprocess
+import sys
+from contextlib import suppress
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from lnocl import process
+from lnocl.core.opencl import kernel_cache
+from lnocl.core.opencl.device import spec_of
+from lnocl.core.opencl.unknown_cpu import POCL
+
+if TYPE_CHECKING:
+    from lnocl.core.opencl.program import Program
+
+# `steps` is 0 to the kernels, so that they do nothing.
+SCRIPT = """
+import sys
+sys.path.insert(0, sys.argv[1])
+import numpy
+import pyopencl as cl
+from lnocl.core.opencl import ahead, device, launch, program, sources, trial, tuning
+ahead.begin = trial.check = lambda *_: None
+context = device.context_of(device.choose(sys.argv[2]).device)
+made = program.Program(context, *eval(sys.argv[3]))
+made.options, launcher = sys.argv[4:], launch.Launcher(made)
+flags = launch.READ_WRITE | cl.mem_flags.COPY_HOST_PTR
+nothing = cl.Buffer(context, flags, hostbuf=bytes(2**20))
+for name in sources.LAST:
+    types = made.arguments[name].items()
+    given = {each: nothing if "*" in kind else 0 for each, kind in types}
+    launcher.bind(name, given | launcher.own)()
+launcher.queue.finish()
+"""
+_begun: dict[Path, subprocess.Popen[bytes]] = {}
+
+
+def begin(file: Path, program: Program) -> None:
+    """Have the kernels that a run needs last compiled, if no process did that before."""
+    device, nowhere = program.context.devices[0], subprocess.DEVNULL
+    is_of_use = device.platform.name == POCL and device.max_compute_units > 1
+    is_new = not (process.is_worker or file in _begun or file.exists())
+    if not is_of_use or not is_new or not kernel_cache.can_write(file.parent):
+        return
+    given = f"{program.grid}, numpy.dtype({program.dtype.str!r}), tuning.{program.tuning}"
+    given += f", {program.oversample}, {program.has_turns}"
+    root = str(Path(__file__).parents[3])
+    script = [sys.executable, "-P", "-c", SCRIPT, root, spec_of(device), given, *program.options]
+    with suppress(OSError):
+        _begun[file] = subprocess.Popen(script, stdin=nowhere, stdout=nowhere, stderr=nowhere)
+        atexit.register(_begun[file].wait)
+
+
+def wait(file: Path) -> None:
+    """Wait for whoever compiles what a file will hold."""
+    if file in _begun:
+        _begun[file].wait()

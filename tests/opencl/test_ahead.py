@@ -1,0 +1,74 @@
+"""Kernels that another process compiles meanwhile: taken from it, and done without it."""
+
+import pytest
+from processes import run_python
+from runtimes import on_pocl
+
+from lnocl.core.opencl import ahead, program, sources
+
+# Prints whether each program was found in the store, and the result of a run.
+CODE = """
+from lnocl import process
+from lnocl.core.opencl import ahead, program
+exec(sys.argv[1])
+class Built(program._Built):
+    def __init__(self, context, text, options, file):
+        super().__init__(context, text, options, file)
+        print("KERNEL void step_rows" in text, self._content is not None)
+program._Built = Built
+print(lnocl.deconvolve(observation, n_iter=3, stop=None, smoothing=0.0, pad=0).extended.sum())
+print([each.returncode for each in ahead._begun.values()])
+"""
+
+NO_PROCESS = """
+program.trial.check = lambda device: None
+sys.executable = "/nonexistent"
+"""
+
+
+def first_run(folder, before=""):
+    done = run_python(CODE, before, POCL_CACHE_DIR=str(folder))
+    assert (done.returncode, done.stderr) == (0, ""), done.stderr
+    return done.stdout.splitlines()
+
+
+@on_pocl
+@pytest.mark.system
+@pytest.mark.parametrize(
+    ("before", "expected", "ended"),
+    [
+        ("", "True True", "[0]"),
+        ("ahead.SCRIPT = 'raise SystemExit(3)'", "True False", "[3]"),
+        ("process.is_worker = True", "True False", "[]"),
+        (NO_PROCESS, "True False", "[]"),
+    ],
+    ids=["done", "failed", "worker", "no process"],
+)
+def test_another_process_compiles_what_is_needed_last(tmp_path, before, expected, ended):
+    cold = first_run(tmp_path, before)
+    assert cold[:2] == ["False False", expected]
+    assert cold[3] == ended
+    assert first_run(tmp_path, before) == ["False True", "True True", cold[2], "[]"]
+
+
+@pytest.mark.parametrize("kernel", [sources.FIRST[0], sources.LAST[0], "scale_rows"])
+def test_a_program_has_its_own_kernels_on_their_lines(kernel):
+    text, whole = sources.beside(kernel, program.source()), program.source()
+    own = [name for name, _ in sources.KERNEL.findall(text)]
+    assert kernel in own
+    parts = {*sources.FIRST}, {*sources.LAST}
+    others = {name for name, _ in sources.KERNEL.findall(whole)} - set.union(*parts)
+    assert {*own} in (*parts, others)
+    lines = zip(text.splitlines(), whole.splitlines(), strict=True)
+    assert all(one in ("", other) for one, other in lines)
+
+
+def test_numbers_of_arguments_are_told_from_arrays():
+    types = sources.arguments(program.source())["step_rows"]
+    assert types["mu"].split() == ["const", "real"]
+    assert types["has_weights"].split() == ["const", "int"]
+    assert types["steps"].split() == ["__global", "const", "real", "*restrict"]
+
+
+def test_no_test_process_compiles_ahead():
+    assert not ahead._begun
