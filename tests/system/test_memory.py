@@ -43,12 +43,10 @@ print("peak", next(int(s.split()[1]) for s in open("/proc/self/status") if "VmHW
 @pytest.mark.parametrize(("n", "p", "error"), [(0, 1, 0.03), (1500, 1, 0.0), (150, 4, 0.03)])
 def test_what_stars_take_is_announced(n, p, error):
     """Before, 1000 and 3000 stars were said to take as much as none, a third of their memory."""
-    done = subprocess.run(
-        [sys.executable, "-c", RUN, str(n), str(p), str(error)],
-        capture_output=True,
-        text=True,
-        check=True,
-    )
+    command = [sys.executable, "-c", RUN, str(n), str(p), str(error)]
+    # The first may compile kernels, which takes 100 MiB more.
+    for _ in range(2):
+        done = subprocess.run(command, capture_output=True, text=True, check=True)
     device, host = map(float, re.findall(r"([\d.]+) MiB", done.stdout))
     peak = float(re.search(r"peak ([\d.]+)", done.stdout)[1])
     assert 1 / 1.3 < peak / (device + host) < 1.3
