@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.stats import norm
 
-from lnocl.core.runs.outcome import Outcome
+from lnocl.core.runs.outcome import Outcome, mean_over_epochs
 from lnocl.core.scene.arrays import Array, number_in, whole
 from lnocl.core.scene.detector import on_sky
 from lnocl.core.scene.estimate import Estimate
@@ -329,7 +329,7 @@ class Significance:
         limits = {f"{100 * each:g}": limit for each, limit in zip(shares, found, strict=True)}
         observation, scene = self._outcome.observation, self._outcome.scene
         n_epochs = observation.n_epochs
-        fluxes = self._outcome.mean_fluxes
+        fluxes = mean_over_epochs(self._outcome.fluxes_of_stars, n_epochs)
         rows: list[tuple[float, ...]] = []
         for s, place in enumerate(on_sky(scene.stars[::n_epochs], observation.oversample)):
             rows += [(float(s + 1), *ring, float(fluxes[s])) for ring in self._rings(place, limits)]

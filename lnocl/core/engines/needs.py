@@ -17,8 +17,8 @@ from lnocl.core.solvers.scaling import Scaling
 N_STEPS = len(Steps().numbers())
 # Buffers of a number a star.
 OF_STARS = "star_fluxes", "star_weights", "star_corrections", "prior_fluxes", "prior_precision"
-# Bytes, half of those that PoCL's compiler takes in a first run: later ones find its kernels.
-COMPILER = 40 * 2**20
+# Bytes that PoCL takes for kernels: those that it compiles, and those that it finds stored.
+COMPILER = 160 * 2**20, 40 * 2**20
 # Estimates of both halves of the counts that are held (`lnocl.core.runs.halves`).
 SNAPSHOTS = 22
 
@@ -94,7 +94,7 @@ def has_background_map(scene: Scene) -> bool:
 
 
 def host_bytes(
-    scene: Scene, scaling: Scaling | None, of_device: int, itemsize: int, halves: bool
+    scene: Scene, scaling: Scaling | None, of_device: int, program: Program, halves: bool
 ) -> int:
     """Return about how many bytes the process takes on the host, besides the device's.
 
@@ -111,20 +111,20 @@ def host_bytes(
         That of its steps.
     of_device : int
         Bytes that the process holds for a device, which is its CPU.
-    itemsize : int
-        Bytes of a number on the device.
+    program : Program
+        That of the scene.
     halves : bool
         Whether halves of the counts are run.
     """
     held, most = held_bytes()
     pixels = math.prod(scene.grid)
     frame = pixels * np.dtype(np.float64).itemsize
-    to_come = COMPILER + max(2 * frame, 6 * frame - of_device)
+    to_come = COMPILER[program.is_stored] + max(2 * frame, 6 * frame - of_device)
     if scene.rotations and scaling is None:  # else the host has made its model before
         to_come += (scene.n_images + 2) * frame
     if scaling is not None:
         to_come += 2 * scaling.star_information.band.nbytes
     found = max(held + to_come, most - of_device)
     if halves:
-        found += 2 * scene.observation.images.nbytes + 2 * SNAPSHOTS * pixels * itemsize
+        found += 2 * (scene.observation.images.nbytes + SNAPSHOTS * pixels * program.dtype.itemsize)
     return found

@@ -129,7 +129,7 @@ class OpenCLEngine:
             announce(
                 chosen,
                 (1 + halves) * self.bytes_needed,
-                host_bytes(scene, scaling, of_device, dtype.itemsize, halves),
+                host_bytes(scene, scaling, of_device, self.program, halves),
                 describe_tuning(chosen, dtype, self.program.tuning),
             )
         self._launcher = Launcher(self.program)

@@ -153,7 +153,8 @@ class Program:
         self.options = ["-cl-std=CL1.2", "-w", *definitions]
         self.arguments = arguments(source())
         self._kernels: dict[str, cl.Kernel] = {}
-        ahead.begin(_file(context, beside(LAST[0], source()), self.options), self)
+        self._last = _file(context, beside(LAST[0], source()), self.options)
+        ahead.begin(self._last, self)
 
     def kernel(self, name: str) -> cl.Kernel:
         """Return a kernel, always the same one."""
@@ -163,6 +164,11 @@ class Program:
             self._kernels[name] = built.kernel(name)
             weakref.finalize(self, built.take_back, name, self._kernels[name])
         return self._kernels[name]
+
+    @property
+    def is_stored(self) -> bool:
+        """Whether a process has compiled it before."""
+        return self._last.exists()
 
     @property
     def row_blocks(self) -> int:

@@ -173,7 +173,8 @@ class GuardedRuns:
             rounds = (moved, FIRST_ITERATIONS), *[(setup, ITERATIONS)] * (MAX_ROUNDS - 1)
             for each, n_iter in rounds:
                 before, found = found, self._run(each, found, n_iter, guard)
-                if not found.misfit.is_significant or _is_settled(before.misfit, found.misfit):
+                change = abs(found.misfit.kappa - before.misfit.kappa)
+                if not found.misfit.is_significant or change < SETTLED * found.misfit.kappa:
                     break
         return found
 
@@ -400,8 +401,3 @@ def rings_of(psfs: Array, oversample: int) -> Rings:
 
 def _judged(estimate: Estimate, misfit: PsfMisfit) -> Judged:
     return Judged(estimate.scene, estimate.sky, estimate.star_fluxes, misfit)
-
-
-def _is_settled(before: PsfMisfit, after: PsfMisfit) -> bool:
-    """Return whether kappa has changed by less than the share `SETTLED` of itself."""
-    return abs(after.kappa - before.kappa) < SETTLED * after.kappa

@@ -217,11 +217,6 @@ class Outcome:
         return np.where(self.scene.is_shown[:n], self.star_fluxes[:n], np.nan)
 
     @property
-    def mean_fluxes(self) -> Array:
-        """The mean of each star over the epochs that show it, electrons; NaN where none does."""
-        return mean_over_epochs(self.fluxes_of_stars, self.observation.n_epochs)
-
-    @property
     def moves(self) -> bool:
         """Whether stars were moved."""
         return self.setup.refine_positions and self.scene.n_stars > 0

@@ -137,7 +137,8 @@ class PsfFamilies:
         values = np.zeros((len(self._psfs), len(self.prior)))
         start = np.random.default_rng(search).standard_normal((len(self._psfs), self._n_phases))
         values[:, self._phases] = FIRST * PUPIL * start
-        return PsfParameters(values, self._no_pixels())
+        pixels = (0, 0) if self.pixels is None else self._grid
+        return PsfParameters(values, np.zeros((len(self._psfs), *pixels)))
 
     def slopes(
         self, j: int, grid: tuple[int, int], values: Array
@@ -207,9 +208,6 @@ class PsfFamilies:
         """Which of the parameters are phases."""
         before = sum(len(FAMILIES[name]) for name in FAMILIES if name in self._names)
         return slice(before, before + self._n_phases)
-
-    def _no_pixels(self) -> Array:
-        return np.zeros((len(self._psfs), *((0, 0) if self.pixels is None else self._grid)))
 
     def _exponents(self, j: int, grid: tuple[int, int]) -> list[Any]:
         """Return the B_k of PSF j."""

@@ -16,6 +16,7 @@ from lnocl.errors import InputError
 
 # What messages advise where values are in a wrong unit.
 ADVICE = {"pix": "; convert them with the WCS of the images"}
+SPELLED = {"pix": "pixels", "deg": "degrees", "s": "seconds"}
 
 
 class _Numbers:
@@ -64,7 +65,7 @@ def in_unit(name: str, values: Any, wanted: Any) -> Any:
     if unit.physical_type == "dimensionless":
         return numbers * unit.to("")
     if not unit.is_equivalent(wanted):
-        kind = f"in {_spelled(wanted)}" if wanted else "numbers without a unit"
+        kind = f"in {SPELLED.get(wanted, wanted)}" if wanted else "numbers without a unit"
         raise InputError(f"`{name}` must be {kind}, not in {unit}{ADVICE.get(wanted, '')}")
     return numbers * unit.to(wanted)
 
@@ -72,10 +73,6 @@ def in_unit(name: str, values: Any, wanted: Any) -> Any:
 def bare(name: str, values: Any) -> Any:
     """Return values without their unit: of PSFs only the shape counts."""
     return split(name, values)[0]
-
-
-def _spelled(unit: Any) -> str:
-    return {"pix": "pixels", "deg": "degrees", "s": "seconds"}.get(unit, str(unit))
 
 
 def _gather(name: str, values: Any, depth: int = 0) -> Any:
