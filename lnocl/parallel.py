@@ -135,10 +135,10 @@ def _client_of(parallel: Parallel) -> Iterator[Client]:
         yield client
         return
     _refuse_a_script_without_guard()
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    n = int(parallel) if parallel is not True else int(cores or 1)
+    cores = process.n_cores()
+    n = int(parallel) if parallel is not True else cores
     # PoCL starts a thread a core in each process, where they would share the cores.
-    threads = {"POCL_MAX_PTHREAD_COUNT": str(max(int(cores or 1) // n, 1))}
+    threads = {"POCL_MAX_PTHREAD_COUNT": str(max(cores // n, 1))}
     # A worker that ends twice within this time is given up, even where it was started again.
     with dask.config.set({"distributed.deploy.lost-worker-timeout": "1 day"}):
         cluster = distributed.LocalCluster(

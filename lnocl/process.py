@@ -21,6 +21,11 @@ if hasattr(os, "register_at_fork"):  # Windows does not fork
     )
 
 
+def n_cores() -> int:
+    """Return how many cores this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
 @contextmanager
 def ignored_warnings(category: type[Warning] = Warning) -> Iterator[None]:
     """Leave warnings of a category unsaid."""

@@ -1,10 +1,17 @@
 """Kernels that another process compiles meanwhile: taken from it, and done without it."""
 
+import errno
+import os
+import time
+from pathlib import Path
+
+import numpy as np
 import pytest
 from processes import run_python
 from runtimes import on_pocl
 
 from lnocl.core.opencl import ahead, program, sources
+from lnocl.core.opencl.device import choose, context_of
 
 # Prints whether each program was found in the store, and the result of a run.
 CODE = """
@@ -40,15 +47,51 @@ def first_run(folder, before=""):
         ("", "True True", "[0]"),
         ("ahead.SCRIPT = 'raise SystemExit(3)'", "True False", "[3]"),
         ("process.is_worker = True", "True False", "[]"),
+        ("process.n_cores = lambda: 1", "True False", "[]"),
         (NO_PROCESS, "True False", "[]"),
     ],
-    ids=["done", "failed", "worker", "no process"],
+    ids=["done", "failed", "worker", "one core", "no process"],
 )
 def test_another_process_compiles_what_is_needed_last(tmp_path, before, expected, ended):
     cold = first_run(tmp_path, before)
     assert cold[:2] == ["False False", expected]
     assert cold[3] == ended
     assert first_run(tmp_path, before) == ["False True", "True True", cold[2], "[]"]
+
+
+UNNEEDED = """
+from lnocl.core.opencl import ahead, device, program
+ahead.SCRIPT = "import time; print(time.sleep(100))"
+program.Program(device.context_of(device.choose().device), (16, 16), np.dtype("f4"))
+(child,) = ahead._begun.values()
+print(child.pid)
+"""
+
+
+@on_pocl
+@pytest.mark.system
+def test_what_nobody_waits_for_ends_with_the_process(tmp_path):
+    done = run_python(UNNEEDED, POCL_CACHE_DIR=str(tmp_path))
+    assert (done.returncode, done.stderr) == (0, "")
+    state = Path("/proc", done.stdout.strip(), "stat")
+    last = time.monotonic() + 20.0
+    while is_there := state.exists() and state.read_text().split()[2] != "Z":
+        assert time.monotonic() < last
+        time.sleep(0.05)
+    assert not is_there
+
+
+def test_a_store_that_may_not_be_looked_into_holds_nothing(monkeypatch):
+    genuine = os.stat
+
+    def refuse(path, *given, **more):
+        if str(path).endswith(".kernels"):
+            raise PermissionError(errno.EACCES, "Permission denied")
+        return genuine(path, *given, **more)
+
+    monkeypatch.setattr(os, "stat", refuse)
+    context = context_of(choose().device)
+    assert not program.Program(context, (16, 16), np.dtype(np.float32)).is_stored
 
 
 @pytest.mark.parametrize("kernel", [sources.FIRST[0], sources.LAST[0], "scale_rows"])

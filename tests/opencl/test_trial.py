@@ -6,12 +6,14 @@ import subprocess
 from pathlib import Path
 from types import SimpleNamespace
 
+import numpy as np
+import pyopencl as cl
 import pytest
 from processes import run_python
 from runtimes import on_pocl
 
 import lnocl
-from lnocl.core.opencl import device, kernel_cache, trial
+from lnocl.core.opencl import device, kernel_cache, program, sources, trial
 
 pytestmark = [on_pocl, pytest.mark.system]
 
@@ -158,6 +160,20 @@ def test_a_driver_that_ends_the_process_is_named(ending, words, tmp_path, monkey
     trial.check.__wrapped__(chosen)
     monkeypatch.setattr(trial, "_try", lambda *_: pytest.fail("tried again"))
     trial.check.__wrapped__(chosen)
+
+
+def test_a_driver_is_tried_with_all_kernels(monkeypatch):
+    tried, build = [], program._build
+
+    def recorded(context, text, options):
+        tried.extend(name for name, _ in sources.KERNEL.findall(text))
+        return build(context, text, options)
+
+    monkeypatch.setattr(trial, "check", trial.check)  # which the trial puts out of the way
+    monkeypatch.setattr(program, "_build", recorded)
+    context = device.context_of(device.choose().device)
+    exec(trial.KERNELS, {"context": context, "cl": cl, "numpy": np})
+    assert {*tried} == {name for name, _ in sources.KERNEL.findall(program.source())}
 
 
 @pytest.mark.parametrize("lack", ["noexec", "space", "files"])

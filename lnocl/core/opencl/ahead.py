@@ -7,6 +7,7 @@ it failed they are not there, and are compiled as they would be without it.
 from __future__ import annotations
 
 import atexit
+import signal
 import subprocess
 import sys
 from contextlib import suppress
@@ -14,13 +15,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from lnocl import process
-from lnocl.core.opencl import kernel_cache
+from lnocl.core.opencl import kernel_cache, trial
 from lnocl.core.opencl.device import spec_of
 from lnocl.core.opencl.unknown_cpu import POCL
 
 if TYPE_CHECKING:
     from lnocl.core.opencl.program import Program
 
+# Seconds after which nobody waits any longer.
+LONGEST = 60.0
 # `steps` is 0 to the kernels, so that they do nothing.
 SCRIPT = """
 import sys
@@ -32,8 +35,7 @@ ahead.begin = trial.check = lambda *_: None
 context = device.context_of(device.choose(sys.argv[2]).device)
 made = program.Program(context, *eval(sys.argv[3]))
 made.options, launcher = sys.argv[4:], launch.Launcher(made)
-flags = launch.READ_WRITE | cl.mem_flags.COPY_HOST_PTR
-nothing = cl.Buffer(context, flags, hostbuf=bytes(2**20))
+nothing = cl.Buffer(context, cl.mem_flags.COPY_HOST_PTR, hostbuf=bytes(2**20))
 for name in sources.LAST:
     types = made.arguments[name].items()
     given = {each: nothing if "*" in kind else 0 for each, kind in types}
@@ -46,9 +48,11 @@ _begun: dict[Path, subprocess.Popen[bytes]] = {}
 def begin(file: Path, program: Program) -> None:
     """Have the kernels that a run needs last compiled, if no process did that before."""
     device, nowhere = program.context.devices[0], subprocess.DEVNULL
-    is_of_use = device.platform.name == POCL and device.max_compute_units > 1
-    is_new = not (process.is_worker or file in _begun or file.exists())
-    if not is_of_use or not is_new or not kernel_cache.can_write(file.parent):
+    is_new = not (process.is_worker or file in _begun or program.is_stored)
+    if not is_new or device.platform.name != POCL or process.n_cores() < 2:
+        return
+    trial.check(device)  # for what it would die of too
+    if not kernel_cache.can_write(file.parent):
         return
     given = f"{program.grid}, numpy.dtype({program.dtype.str!r}), tuning.{program.tuning}"
     given += f", {program.oversample}, {program.has_turns}"
@@ -56,10 +60,11 @@ def begin(file: Path, program: Program) -> None:
     script = [sys.executable, "-P", "-c", SCRIPT, root, spec_of(device), given, *program.options]
     with suppress(OSError):
         _begun[file] = subprocess.Popen(script, stdin=nowhere, stdout=nowhere, stderr=nowhere)
-        atexit.register(_begun[file].wait)
+        atexit.register(_begun[file].send_signal, signal.SIGINT)
 
 
 def wait(file: Path) -> None:
     """Wait for whoever compiles what a file will hold."""
     if file in _begun:
-        _begun[file].wait()
+        with suppress(subprocess.TimeoutExpired):
+            _begun[file].wait(LONGEST)

@@ -271,9 +271,9 @@ def can_write(folder: Path) -> bool:
     """Return whether files can be written to a folder, which is made; warn once where not."""
     try:
         folder.mkdir(parents=True, exist_ok=True, mode=0o700)
-        if os.access(folder, os.W_OK | os.X_OK):
+        if os.access(folder, os.W_OK | os.X_OK) and shutil.disk_usage(folder).free >= MIN_FREE:
             return True
-        reason = "it cannot be written to"
+        reason = "it cannot be written to, or is nearly full"
     except OSError as error:
         reason = str(error.strerror)
     if folder not in _refused:

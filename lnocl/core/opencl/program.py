@@ -87,6 +87,8 @@ class Program:
         Those of each transform: "row", "column", "image_row" and "image_column".
     rows : int
         Rows that a block of spectra takes in memory.
+    is_stored : bool
+        Whether a process has compiled it before.
     max_groups : int
         Work-groups that have a scratch in global memory; 0 where it is local.
 
@@ -153,8 +155,10 @@ class Program:
         self.options = ["-cl-std=CL1.2", "-w", *definitions]
         self.arguments = arguments(source())
         self._kernels: dict[str, cl.Kernel] = {}
-        self._last = _file(context, beside(LAST[0], source()), self.options)
-        ahead.begin(self._last, self)
+        last = _file(context, beside(LAST[0], source()), self.options)
+        self.is_stored = os.path.exists(last)  # a folder may not be looked into
+        with LOCK:
+            ahead.begin(last, self)
 
     def kernel(self, name: str) -> cl.Kernel:
         """Return a kernel, always the same one."""
@@ -164,11 +168,6 @@ class Program:
             self._kernels[name] = built.kernel(name)
             weakref.finalize(self, built.take_back, name, self._kernels[name])
         return self._kernels[name]
-
-    @property
-    def is_stored(self) -> bool:
-        """Whether a process has compiled it before."""
-        return self._last.exists()
 
     @property
     def row_blocks(self) -> int:

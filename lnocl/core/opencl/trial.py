@@ -43,9 +43,11 @@ finally:
     print("lives")
 """
 KERNELS = """
-from lnocl.core.opencl import launch, program, trial
+from lnocl.core.opencl import launch, program, sources, trial
 trial.check = lambda device: None
-launcher = launch.Launcher(program.Program(context, (8, 8), numpy.dtype("f4")))
+made = program.Program(context, (8, 8), numpy.dtype("f4"))
+made.kernel(sources.LAST[0])  # and all that are compiled with it
+launcher = launch.Launcher(made)
 buffers = {each: cl.Buffer(context, launch.READ_WRITE, 2**16) for each in ("pixels", "spectra")}
 for name in ("rfft_rows", "fft_columns"):
     launcher.bind(name, buffers)()

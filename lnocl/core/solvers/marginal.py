@@ -17,7 +17,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from lnocl.core.scene.arrays import Array
 from lnocl.core.scene.estimate import Estimate
 from lnocl.core.scene.texture import core
 from lnocl.core.solvers.fluxes import variances
@@ -63,11 +62,6 @@ def marginal(estimate: Estimate) -> Estimate:
         light = of_core * (near.expected + near.source.of(x)) * scene.unit
         light = np.maximum(light, -after[there])
         lost = float((star_fluxes[star] - fluxes[star]).mean()) * scene.share_shown(first)
-        after[there] += _at_most(light, lost)
+        whole = float(light.sum())  # of which some is taken, not less than nothing, nor more
+        after[there] += light * (np.clip(lost / whole, 0.0, 1.0) if whole else 0.0)
     return Estimate(scene, after, fluxes)
-
-
-def _at_most(light: Array, total: float) -> Array:
-    """Return a share of some light, so that its sum lies between 0 and a total."""
-    whole = float(light.sum())
-    return light * (np.clip(total / whole, 0.0, 1.0) if whole else 0.0)

@@ -213,7 +213,7 @@ class PsfErrors:
 
     def _scatter_at(self, j: int, psf: Movable, at: Array) -> Cutout:
         scatter = self._estimate.scene.observation.psf_scatter[j]
-        return psf.changed(partial(_instead, scatter)).at(*at)
+        return psf.changed(lambda own: own.sum() * scatter).at(*at)
 
     def _of_stars(
         self, j: int, seen_at: Callable[[int, Movable, Array], Cutout], *several: int
@@ -282,11 +282,6 @@ def _changed(psf: Array, error: float, most: tuple[int, int], images: tuple[int,
 def _on_border(psf: Array) -> float:
     """Return the mean of the outermost pixels of a PSF."""
     return float(np.mean([*psf[0], *psf[-1], *psf[1:-1, 0], *psf[1:-1, -1]]))
-
-
-def _instead(scatter: Array, psf: Array) -> Array:
-    """Return the scatter of a PSF, as bright as that."""
-    return psf.sum() * scatter
 
 
 class PixelErrors:
