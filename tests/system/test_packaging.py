@@ -58,8 +58,9 @@ def unpacked(built, tmp_path_factory):
     """The files of the sdist."""
     folder = tmp_path_factory.mktemp("sdist")
     (sdist,) = built.glob("*.tar.gz")
+    filtered = {"filter": "data"} if hasattr(tarfile, "data_filter") else {}  # not before 3.11.4
     with tarfile.open(sdist) as archive:
-        archive.extractall(folder, filter="data")
+        archive.extractall(folder, **filtered)
     (root,) = folder.iterdir()
     return root
 
