@@ -27,7 +27,7 @@ LONGEST = 60.0
 # `steps` is 0 to the kernels, so that they do nothing.
 SCRIPT = """
 import sys
-sys.path.insert(0, sys.argv[1])
+sys.path.append(sys.argv[1])
 import numpy
 import pyopencl as cl
 from lnocl.core.opencl import ahead, device, launch, program, sources, trial, tuning
