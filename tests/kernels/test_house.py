@@ -27,7 +27,7 @@ def test_kernel_twin_and_test_have_one_name(name):
 
 
 def test_no_file_defines_a_macro_of_another():
-    """All files are one program, in which the later definition would hold without a word."""
+    """Each program has all files, and there the later definition would hold without a word."""
     definition = re.compile(r"^ *# *define +(\w+)", re.MULTILINE)
     files = defaultdict(set)
     for path in FOLDER.glob("*.cl"):
