@@ -25,14 +25,14 @@ from lnocl.core.opencl.launch import Launch
 
 
 def timed(function, seconds, name):
-    """Return the function, which adds its seconds to those under a name."""
+    """Return a function that does the same, and appends a name and the seconds that it takes."""
 
     def call(*arguments):
-        begun = time.perf_counter()
+        start = time.perf_counter()
         try:
             return function(*arguments)
         finally:
-            seconds.append((name, time.perf_counter() - begun))
+            seconds.append((name, time.perf_counter() - start))
 
     return call
 

@@ -170,7 +170,9 @@ class TestStrangers:
     def test_a_pipe_is_not_waited_for(self, tmp_path):
         os.mkfifo(tmp_path / "a.kernels")
         assert kernel_cache.read(tmp_path / "a.kernels") is None
+        before = set(os.listdir("/dev/fd"))
         assert kernel_cache.read(tmp_path) is None
+        assert set(os.listdir("/dev/fd")) == before
 
     def test_folders_and_files_are_their_owners_alone(self, tmp_path):
         before = os.umask(0)

@@ -206,8 +206,7 @@ def read(file: Path) -> bytes | None:
         The file is damaged, and is removed; or it is not this user's alone.
     """
     try:
-        # Nor is a pipe waited for.
-        with open(os.open(file, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0)), "rb") as stream:
+        with open(file, "rb", opener=_without_waiting) as stream:
             state = os.fstat(stream.fileno())
             if not stat.S_ISREG(state.st_mode):
                 return None
@@ -224,6 +223,11 @@ def read(file: Path) -> bytes | None:
         return content
     discard(file)
     return None
+
+
+def _without_waiting(name: str, flags: int) -> int:
+    """Open a file, and a pipe without waiting for its other end."""
+    return os.open(name, flags | getattr(os, "O_NONBLOCK", 0))
 
 
 def discard(file: Path) -> None:
