@@ -9,7 +9,7 @@ import threading
 import time
 import uuid
 import warnings
-from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
 from contextlib import closing, contextmanager, suppress
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeVar
 
@@ -17,7 +17,7 @@ from lnocl import process
 from lnocl.errors import InputError, LnoclError, counted
 
 if TYPE_CHECKING:
-    from distributed import Client, Future, LocalCluster
+    from distributed import Client, Future, LocalCluster, as_completed
 
 Task = TypeVar("Task")
 Answer = TypeVar("Answer")
@@ -245,6 +245,7 @@ def _round(
 ) -> Iterator[tuple[int, tuple[Answer, Warned] | _Ended]]:
     """Yield what workers found for tasks that are waiting, but for those that are lost."""
     import dask
+    from distributed import as_completed
     from distributed.client import FutureCancelledError
     from distributed.scheduler import KilledWorker
 
@@ -258,8 +259,8 @@ def _round(
             client.replicate([made])
             for k, task in waiting.items():
                 futures[client.submit(_do, token, made, task, key=f"lnocl-{token}-{k}")] = k
-        # One that is done is dropped, lest it is done again where its worker is lost.
-        for future in _completed(client, list(futures)):
+        # One that is done is let go, lest it is done again where its worker is lost.
+        for future in _completed(client, as_completed(futures, loop=client.loop)):
             k = futures.pop(future)
             try:
                 answer = future.result(timeout=PATIENCE)
@@ -270,6 +271,7 @@ def _round(
             except KilledWorker as error:
                 n_ended = counted(error.allowed_failures + 1, "worker")
                 answer = _Ended(f"{n_ended} ended at the same task, perhaps for lack of memory")
+            del future
             yield k, answer
     except TimeoutError:
         raise LnoclError(f"the scheduler has had no worker for {PATIENCE:g} s") from None
@@ -284,25 +286,21 @@ _LOCK = threading.Lock()
 _held: dict[str, Callable[[Any], Any]] = {}
 
 
-def _completed(client: Client, futures: Sequence[Future]) -> Iterator[Future]:
-    """Yield futures as they are completed, or lost.
+def _completed(client: Client, completed: as_completed) -> Iterator[Future]:
+    """Yield futures as they are completed, or lost; hold none of those that were yielded.
 
     Raises
     ------
     TimeoutError
         There is no worker for `PATIENCE`.
     """
-    from distributed import as_completed
-
-    completed = as_completed(futures, loop=client.loop)
     alive = looked = time.monotonic()
     while not completed.is_empty():
-        batch = completed.next_batch(block=False)
-        yield from batch
-        now = time.monotonic()
-        if batch:
-            alive = now
+        if completed.has_ready():
+            yield next(completed)
+            alive = time.monotonic()
             continue
+        now = time.monotonic()
         if now - looked > LOOK_AFTER:
             looked = now
             if _has_workers(client):

@@ -3,6 +3,7 @@
 import math
 import os
 import signal
+import time
 
 import numpy as np
 import pytest
@@ -43,23 +44,35 @@ def targets(tmp_path, monkeypatch):
 class Disturbance:
     """Kills two workers whose results have arrived, and cuts the connection a little later."""
 
-    def __init__(self, client):
-        self.client = client
-        self.processes, self.killed, self.is_cut = [], [], False
+    def __init__(self, cluster, client, names):
+        self.cluster, self.client, self.names = cluster, client, names
+        self.killed, self.is_cut = [], False
+        self.processes = {}  # of the results that have arrived before the cut, by their names
 
     def pass_on(self, found, shown, passed_on=parallel._pass_on):
         record = passed_on(found, shown)
-        if record.process:
-            self.processes.append(process_of(record.process))
+        if self.is_cut:
+            return record
+        self.processes[record.name] = record.process
         n_done = len(self.processes)
-        alive = [each for each in self.processes if each not in self.killed]
+        workers = [process_of(each) for each in self.processes.values() if each]
+        alive = [each for each in workers if each not in self.killed]
         if alive and n_done >= (N_TARGETS // 3, N_TARGETS // 2, math.inf)[len(self.killed)]:
+            self.await_forgetting()
             self.killed.append(alive[0])
             os.kill(alive[0], signal.SIGKILL)
-        if n_done >= N_TARGETS * 2 // 3 and not self.is_cut:
+        if n_done >= N_TARGETS * 2 // 3:
             self.is_cut = True
             self.client.loop.add_callback(self.client.scheduler_comm.comm.abort)
         return record
+
+    def await_forgetting(self):
+        """Wait until the scheduler has forgotten the tasks whose results have arrived."""
+        arrived = tuple(f"-{self.names.index(name)}" for name in self.processes)
+        deadline = time.monotonic() + 30
+        while held := [each for each in self.cluster.scheduler.tasks if each.endswith(arrived)]:
+            assert time.monotonic() < deadline, f"{held} would be done again"
+            time.sleep(0.01)
 
 
 def process_of(text):
@@ -75,7 +88,7 @@ def test_a_lost_worker_and_connection_change_no_result(targets, capfd, monkeypat
         ) as cluster,
         distributed.Client(cluster) as client,
     ):
-        disturbance = Disturbance(client)
+        disturbance = Disturbance(cluster, client, targets)
         monkeypatch.setattr(parallel, "_pass_on", disturbance.pass_on)
         words = ["batch", "targets.csv", "-o", "two", "--parallel", "current-scheduler"]
         assert cli.main(words) == 1
@@ -84,10 +97,10 @@ def test_a_lost_worker_and_connection_change_no_result(targets, capfd, monkeypat
     for name in ("name", "status", "message", "n_iter", "stopped", "warnings", "device"):
         assert one[name].tolist() == two[name].tolist(), name
     assert one["status"].tolist() == ["failed" if k == 4 else "done" for k in range(N_TARGETS)]
-    processes = {process_of(each) for each in two["process"]}
     assert len(disturbance.killed) == 2
     assert disturbance.is_cut
-    assert processes & {*disturbance.killed}  # what lost workers had done is not done again
-    assert processes - {*disturbance.killed}
+    processes = dict(two.iterrows("name", "process"))
+    for name, process in disturbance.processes.items():
+        assert processes[name] == process  # what has arrived is not done again
     for name in set(targets) - {"gone"}:
         np.testing.assert_equal(outcome(f"one/{name}.fits"), outcome(f"two/{name}.fits"))
