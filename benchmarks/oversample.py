@@ -102,6 +102,7 @@ def speed(device):
             for key, engine in runs.items():
                 count = 12 if turn else 2
                 begin = time.perf_counter()
+                engine.go_on(4000, 0.0)
                 for _ in range(count):
                     engine.tick()
                 engine.look()

@@ -42,19 +42,21 @@ INLINE cvec add_edge(const cvec a, const real re, const real im, const real p_re
 /* otfs_image = FFT(spectra) / (4 NX NY) along the columns, made from the row spectra of a PSF: 1 / (NX NY)
  * for the inverse transforms, 1 / 4 for the two factors 2 that rfft_rows leaves. Column 0 and
  * otf_edges get (K_A + K_B) / 2 and (K_A - K_B) / 2.
- * spectra: one array, const. otfs: n_images arrays; that of `image` is written, and its part
- * of otf_edges, [n_images][NY][2].
+ * spectra: n_images arrays, const, of which array 0 is read. otfs: an array an image; that of `image`
+ * is written, and its part of otf_edges, [..][NY][2]. steps[GOING] 0: nothing.
  * Launch: up to COLUMN_BLOCKS groups. Out of place. Scratch: NY points.
  * Twin: reference.otf_columns.
  */
 KERNEL void otf_columns(
     __global vec *restrict otfs, __global real *restrict otf_edges,
-    __global const vec *restrict spectra, const int image,
-    __global const real *restrict column_roots, SCRATCH vec *restrict scratch)
+    __global const vec *restrict spectra, __global const real *restrict steps, const int image,
+    const int n_images, __global const real *restrict column_roots, SCRATCH vec *restrict scratch)
 {
     const real norm = (real)1 / 4 / NX / NY;
     SCRATCH vec *z = OWN_SCRATCH(scratch, NY);
-    FOR_EACH_BLOCK(block, COLUMN_BLOCKS) {
+    OF_MEMBER(spectra, (size_t)n_images * SPECTRA_SIZE);
+    OF_MEMBER(steps, N_NUMBERS);
+    FOR_EACH_BLOCK_IF(steps[GOING], block, COLUMN_BLOCKS) {
         __global vec *k = otfs + (size_t)image * PIXELS_SIZE + (size_t)block * NY * 2 * SIDE;
         forward_columns(z, spectra + (size_t)block * ROWS * 2 * SIDE, NY, column_roots);
         FOR_EACH(i, NY * 2 * SIDE)
@@ -123,26 +125,28 @@ INLINE cvec convolved(
 }
 
 /* spectra_j <- IFFT(otfs_j FFT(spectra_0)) along the columns: the row spectra of A_j f from f's, in
- * every OVERSAMPLE-th row. FFT(spectra_0) may be held in array 0, which is made last. Array 0 is that
- * of image `first`: an image alone, n_images of 1, has a sky of its own (transmit.cl).
+ * every OVERSAMPLE-th row. Where each image has a sky of its own (has_skies, see transmit.cl) it is
+ * FFT(spectra_j). The FFT of a sky may be held in its array, which is made last.
  * spectra: n_images arrays, written but for their padding. otfs: n_images arrays, const;
  * otf_edges: [n_images][NY][2]. row_phases (HAS_TURNS), by which rows are multiplied then:
  * [n_images][COLUMN_BLOCKS][NY / PHASE_ROWS + PHASE_ROWS][2][BLOCK]. steps[GOING] 0: nothing.
- * Launch: up to COLUMN_BLOCKS groups. In place. Scratch: SCRATCH_POINTS.
+ * Launch: up to COLUMN_BLOCKS groups a sky. In place. Scratch: SCRATCH_POINTS.
  * Twin: reference.convolve_columns.
  */
 KERNEL void convolve_columns(
     __global vec *restrict spectra, __global const vec *restrict otfs,
     __global const real *restrict otf_edges, __global const vec *restrict row_phases,
-    __global const real *restrict steps, const int first, const int n_images,
+    __global const real *restrict steps, const int n_images, const int has_skies,
     __global const real *restrict column_roots, __global const real *restrict image_column_roots,
     SCRATCH vec *restrict scratch)
 {
-    spectra += (size_t)first * SPECTRA_SIZE;
-    otfs += (size_t)first * PIXELS_SIZE;
-    otf_edges += 2 * first * NY;
-    FOR_EACH_BLOCK_IF(steps[GOING], block, COLUMN_BLOCKS) {
-        __global vec *columns = spectra + (size_t)block * ROWS * 2 * SIDE;
+    const int n_own = has_skies ? 1 : n_images; /* images of one sky */
+    OF_MEMBER(spectra, (size_t)n_images * SPECTRA_SIZE);
+    OF_MEMBER(steps, N_NUMBERS);
+    FOR_EACH_BLOCK_IF(steps[GOING], unit, COLUMN_BLOCKS * (n_images / n_own)) {
+        const int block = unit % COLUMN_BLOCKS, sky = unit / COLUMN_BLOCKS;
+        __global vec *columns =
+            spectra + (size_t)sky * SPECTRA_SIZE + (size_t)block * ROWS * 2 * SIDE;
         SCRATCH_OF(scratch, columns);
 #if SCRATCH_BLOCKS > 1
         forward_columns(held, columns, NY, column_roots);
@@ -152,7 +156,9 @@ KERNEL void convolve_columns(
             held[i] = z[i];
         BARRIER;
 #endif
-        for (int image = n_images - 1; image >= 0; --image) {
+        for (int own = n_own - 1; own >= 0; --own) {
+            const int image = sky + own;
+            __global vec *to = columns + (size_t)own * SPECTRA_SIZE;
             __global const vec *k =
                 otfs + (size_t)image * PIXELS_SIZE + (size_t)block * NY * 2 * SIDE;
             __global const real *edge = otf_edges + 2 * image * NY;
@@ -163,8 +169,7 @@ KERNEL void convolve_columns(
             BARRIER;
             dit_inner(z, IMAGE_NY, image_column_roots);
 #if HAS_TURNS
-            __global const vec *phases = PHASES_OF(row_phases, first + image, block);
-            __global vec *to = columns + (size_t)image * SPECTRA_SIZE;
+            __global const vec *phases = PHASES_OF(row_phases, image, block);
             finish_rows(z, NY, column_roots);
             FOR_EACH(piece, NY * SIDE) {
                 const int y = piece / SIDE, lane = piece % SIDE;
@@ -173,37 +178,41 @@ KERNEL void convolve_columns(
             }
             BARRIER;
 #else
-            finish_columns(columns + (size_t)image * SPECTRA_SIZE, z, IMAGE_NY, image_column_roots);
+            finish_columns(to, z, IMAGE_NY, image_column_roots);
 #endif
         }
     }
 }
 
 /* spectra_0 <- IFFT(sum_j conj(otfs_j) FFT(spectra_j)) along the columns: the row spectrum of
- * sum_j A_j^T (r_j - w_j) from those of the r_j - w_j. Shapes as in convolve_columns; array 0 alone
- * is written. steps[FRESH] 0: nothing.
- * Launch: up to COLUMN_BLOCKS groups. In place. Scratch: SCRATCH_POINTS.
+ * sum_j A_j^T (r_j - w_j) from those of the r_j - w_j. Where each image has a sky of its own
+ * (has_skies) spectra_j <- IFFT(conj(otfs_j) FFT(spectra_j)). Shapes as in convolve_columns; the
+ * arrays of skies alone are written. steps[FRESH] 0: nothing.
+ * Launch: up to COLUMN_BLOCKS groups a sky. In place. Scratch: SCRATCH_POINTS.
  * Twin: reference.correlate_columns.
  */
 KERNEL void correlate_columns(
     __global vec *restrict spectra, __global const vec *restrict otfs,
     __global const real *restrict otf_edges, __global const vec *restrict row_phases,
-    __global const real *restrict steps, const int first, const int n_images,
+    __global const real *restrict steps, const int n_images, const int has_skies,
     __global const real *restrict column_roots, __global const real *restrict image_column_roots,
     SCRATCH vec *restrict scratch)
 {
-    spectra += (size_t)first * SPECTRA_SIZE;
-    otfs += (size_t)first * PIXELS_SIZE;
-    otf_edges += 2 * first * NY;
-    FOR_EACH_BLOCK_IF(steps[FRESH], block, COLUMN_BLOCKS) {
-        __global vec *columns = spectra + (size_t)block * ROWS * 2 * SIDE;
+    const int n_own = has_skies ? 1 : n_images; /* images of one sky */
+    OF_MEMBER(spectra, (size_t)n_images * SPECTRA_SIZE);
+    OF_MEMBER(steps, N_NUMBERS);
+    FOR_EACH_BLOCK_IF(steps[FRESH], unit, COLUMN_BLOCKS * (n_images / n_own)) {
+        const int block = unit % COLUMN_BLOCKS, sky = unit / COLUMN_BLOCKS;
+        __global vec *columns =
+            spectra + (size_t)sky * SPECTRA_SIZE + (size_t)block * ROWS * 2 * SIDE;
         SCRATCH_OF(scratch, columns);
-        for (int image = 0; image < n_images; ++image) {
+        for (int own = 0; own < n_own; ++own) {
+            const int image = sky + own;
+            __global const vec *from = columns + (size_t)own * SPECTRA_SIZE;
             __global const vec *k =
                 otfs + (size_t)image * PIXELS_SIZE + (size_t)block * NY * 2 * SIDE;
 #if HAS_TURNS
-            __global const vec *phases = PHASES_OF(row_phases, first + image, block);
-            __global const vec *from = columns + (size_t)image * SPECTRA_SIZE;
+            __global const vec *phases = PHASES_OF(row_phases, image, block);
             FOR_EACH(piece, NY * SIDE) {
                 const int y = piece / SIDE, lane = piece % SIDE;
                 const cvec a = LOAD(from + lane, y);
@@ -213,8 +222,7 @@ KERNEL void correlate_columns(
             begin_rows(z, NY, column_roots);
             dif_inner(z, NY, column_roots);
 #else
-            forward_columns(
-                z, columns + (size_t)image * SPECTRA_SIZE, IMAGE_NY, image_column_roots);
+            forward_columns(z, from, IMAGE_NY, image_column_roots);
 #endif
             FOR_EACH(piece, NY * SIDE) {
                 const int t = piece / SIDE, lane = piece % SIDE;
@@ -226,7 +234,7 @@ KERNEL void correlate_columns(
                         (SCRATCH const real *)z + OPPOSITE(t, OVERSAMPLE);
                     product = add_edge(product, edge[0], -edge[1], opposite[0], opposite[BLOCK]);
                 }
-                if (image > 0)
+                if (own > 0)
                     product = add(product, LOAD(held + lane, t));
                 STORE(held + lane, t, product);
             }

@@ -123,6 +123,14 @@ KERNEL void follow_stars(
     const int n_stars, const int cross_blocks)
 {
     SHARED_SUMS(shared);
+    OF_MEMBER(steps, N_NUMBERS);
+    OF_MEMBER(star_fluxes, n_stars);
+    OF_MEMBER(star_steps, 4 * n_stars);
+    OF_MEMBER(star_totals, 2 * n_stars);
+    OF_MEMBER(coupling_sums, n_stars * cross_blocks * 2);
+    OF_MEMBER(prior_fluxes, n_stars);
+    OF_MEMBER(step_sums, 2 * ROW_BLOCKS);
+    OF_MEMBER(change_sums, 4 * ROW_BLOCKS);
     __global real *before = star_steps, *change = before + n_stars;
     __global real *force = change + n_stars, *pushes = force + n_stars;
     const bool is_going = steps[GOING] != 0, is_new = steps[SHORTENED] == 0;
@@ -235,7 +243,7 @@ INLINE void decide(__global real *steps, __global real *objectives, const real_s
  * not below 0 (negative PSF pixels). The step that led there is taken, and its objective recorded,
  * where that fell by SUFFICIENT of what the slope promises, the prior's change included.
  * steps: as above, updated: objectives recorded, shortenings and share, fresh, going, reason.
- * objectives: [iterations + 1][2], a compensated pair each; entry steps[RECORDED] is written.
+ * objectives: objectives_size reals, a compensated pair each; entry steps[RECORDED] is written.
  * data_term: [2], J_0. star_totals: [n_stars][2]. star_corrections, star_weights: [n_stars].
  * ratio_sums: [IMAGE_ROW_BLOCKS][n_images][2]. star_sums: [n_stars][n_images][star_blocks][2].
  * square_sums (mu not 0), smooth_sums (is_smoothed): [ROW_BLOCKS][2].
@@ -249,9 +257,18 @@ KERNEL void collect_sums(
     __global const real *restrict star_sums, __global const real *restrict square_sums,
     __global const real *restrict smooth_sums, __global const real *restrict star_weights,
     const int is_smoothed, const real mu, const int n_images, const int n_stars,
-    const int star_blocks)
+    const int star_blocks, const ulong objectives_size)
 {
     SHARED_SUMS(shared);
+    OF_MEMBER(steps, N_NUMBERS);
+    OF_MEMBER(objectives, objectives_size);
+    OF_MEMBER(data_term, 2);
+    OF_MEMBER(star_totals, 2 * n_stars);
+    OF_MEMBER(star_corrections, n_stars);
+    OF_MEMBER(ratio_sums, IMAGE_ROW_BLOCKS * n_images * 2);
+    OF_MEMBER(star_sums, (size_t)n_stars * n_images * star_blocks * 2);
+    OF_MEMBER(square_sums, 2 * ROW_BLOCKS);
+    OF_MEMBER(smooth_sums, 2 * ROW_BLOCKS);
     /* Every group makes the objective: a barrier in a branch stops PoCL. */
     const real_sum data = sum_group(sum_pairs(ratio_sums, IMAGE_ROW_BLOCKS * n_images), shared);
     real_sum objective = data;

@@ -90,7 +90,8 @@ typedef PASTE(BITS, WIDTH) ivec;
 
 #if SCRATCH_IS_GLOBAL
 #define SCRATCH __global
-#define OWN_SCRATCH(scratch, points) (scratch + (size_t)get_group_id(0) * (2 * SIDE * (points)))
+#define OWN_SCRATCH(scratch, points) \
+    (scratch + (get_group_id(1) * get_num_groups(0) + get_group_id(0)) * (2 * SIDE * (points)))
 #else
 #define SCRATCH __local
 #define OWN_SCRATCH(scratch, points) (scratch)
@@ -123,7 +124,14 @@ enum {
     SHORTENED,    /* how often it was shortened */
     SLOPE,        /* its slope */
     PRIOR_CHANGE, /* and the change of the term of the stars' prior */
+    N_NUMBERS
 };
+
+/* Members of a batch share a scene, but for their images, the mean of their prior, and what an
+ * iteration makes: of these each has its own, one behind the other. This moves p, of which a member has
+ * `size`, to the part of the member that this group works for. Launches have members along axis 1.
+ */
+#define OF_MEMBER(p, size) ((p) += get_group_id(1) * (size))
 
 /* Shares n blocks among however many work-groups were launched. */
 #define FOR_EACH_BLOCK(block, n) \

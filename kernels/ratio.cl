@@ -160,12 +160,18 @@ KERNEL void ratio_rows(
     __global const vec *restrict exposure, const int has_exposure_map,
     __global const vec *restrict star_images, __global const int *restrict star_corners,
     __global const int *restrict star_near, __global const real *restrict star_fluxes,
-    __global const real *restrict steps, const int n_images, const int star_blocks,
-    const int star_columns, __global const real *restrict image_row_roots,
+    __global const real *restrict steps, const int n_images, const int n_stars,
+    const int star_blocks, const int star_columns, __global const real *restrict image_row_roots,
     SCRATCH vec *restrict scratch)
 {
     SHARED_SUMS(shared);
     SCRATCH vec *wide = OWN_SCRATCH(scratch, NX + (OVERSAMPLE > 1 ? IMAGE_NX : 0));
+    OF_MEMBER(spectra, (size_t)n_images * SPECTRA_SIZE);
+    OF_MEMBER(ratio_sums, IMAGE_ROW_BLOCKS * n_images * 2);
+    OF_MEMBER(star_sums, (size_t)n_stars * n_images * star_blocks * 2);
+    OF_MEMBER(images, (size_t)n_images * IMAGE_SIZE);
+    OF_MEMBER(star_fluxes, n_stars);
+    OF_MEMBER(steps, N_NUMBERS);
     FOR_EACH_BLOCK_IF(steps[GOING], unit, IMAGE_ROW_BLOCKS * n_images) {
         const int block = unit / n_images, image = unit % n_images;
         __global vec *row_spectra = spectra + (size_t)image * SPECTRA_SIZE;

@@ -225,15 +225,20 @@ INLINE void begin_rows(SCRATCH vec *z, const int n, __global const real *roots)
 }
 
 /* spectra = 2 sum_x pixels(x) exp(-2 pi i k x / NX), k = 0 .. NX / 2.
- * pixels: one array, const. spectra: one array, all of it but its padding is written.
+ * pixels: one array, const. spectra: n_images arrays, of which array 0 is written, all of it but its
+ * padding. steps[GOING] 0: nothing.
  * Launch: up to ROW_BLOCKS groups. Out of place. Scratch: NX points. Twin: reference.rfft_rows.
  */
 KERNEL void rfft_rows(
     __global vec *restrict spectra, __global const vec *restrict pixels,
+    __global const real *restrict steps, const int n_images,
     __global const real *restrict row_roots, SCRATCH vec *restrict scratch)
 {
     SCRATCH vec *z = OWN_SCRATCH(scratch, NX);
-    FOR_EACH_BLOCK(block, ROW_BLOCKS) {
+    OF_MEMBER(spectra, (size_t)n_images * SPECTRA_SIZE);
+    OF_MEMBER(pixels, PIXELS_SIZE);
+    OF_MEMBER(steps, N_NUMBERS);
+    FOR_EACH_BLOCK_IF(steps[GOING], block, ROW_BLOCKS) {
         __global const vec *from = pixels + (size_t)block * NX * 2 * SIDE;
         FOR_EACH(piece, INNER(NX) * SIDE) {
             const int x = piece / SIDE, lane = piece % SIDE;
@@ -250,15 +255,20 @@ KERNEL void rfft_rows(
 }
 
 /* pixels = sum_k spectra(k) exp(+2 pi i k x / NX) over all k, the half spectra completed.
- * spectra: one array, const. pixels: one array, all of it is written.
+ * spectra: n_images arrays, const, of which array 0 is read. pixels: one array, all of it is written.
+ * steps[GOING] 0: nothing.
  * Launch: up to ROW_BLOCKS groups. Out of place. Scratch: NX points. Twin: reference.irfft_rows.
  */
 KERNEL void irfft_rows(
     __global vec *restrict pixels, __global const vec *restrict spectra,
+    __global const real *restrict steps, const int n_images,
     __global const real *restrict row_roots, SCRATCH vec *restrict scratch)
 {
     SCRATCH vec *z = OWN_SCRATCH(scratch, NX);
-    FOR_EACH_BLOCK(block, ROW_BLOCKS) {
+    OF_MEMBER(pixels, PIXELS_SIZE);
+    OF_MEMBER(spectra, (size_t)n_images * SPECTRA_SIZE);
+    OF_MEMBER(steps, N_NUMBERS);
+    FOR_EACH_BLOCK_IF(steps[GOING], block, ROW_BLOCKS) {
         __global vec *to = pixels + (size_t)block * NX * 2 * SIDE;
         read_tiles(z, spectra, block);
         dit_inner(z, NX, row_roots);

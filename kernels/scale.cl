@@ -39,7 +39,7 @@ INLINE vec scale_points(
  * c = sum_j A_j^T (r_j - w_j), a = 1 / sum_j A_j^T w_j, and 1 + a u not below 0;
  * spectra <- row spectrum of the new f; square_sums: sum f^2; the stars, with p_s = star_weights_s:
  * c_s <- c_s (p_s star_corrections_s + q_s c0_s) / (p_s + q_s c_s), by the prior (c0_s, q_s).
- * spectra: one array, in: row spectrum of c, out: twice the row spectrum of f.
+ * spectra: n_images arrays, of which array 0 is in: row spectrum of c, out: twice the row spectrum of f.
  * extended: one array of pixels, f. inverse_weight: one array of pixels, a (has_weights), or
  * one point, [2][BLOCK], for all. slope, curvature: one array of pixels each, const, those of f
  * (is_smoothed; else they count as 0). square_sums: [ROW_BLOCKS][2].
@@ -55,10 +55,16 @@ KERNEL void scale_rows(
     __global const real *restrict prior_precision, __global const vec *restrict slope,
     __global const vec *restrict curvature, __global const real *restrict steps,
     const int has_weights, const int is_smoothed, const real mu, const int n_stars,
-    __global const real *restrict row_roots, SCRATCH vec *restrict scratch)
+    const int n_images, __global const real *restrict row_roots, SCRATCH vec *restrict scratch)
 {
     SHARED_SUMS(shared);
     SCRATCH vec *z = OWN_SCRATCH(scratch, NX);
+    OF_MEMBER(spectra, (size_t)n_images * SPECTRA_SIZE);
+    OF_MEMBER(extended, PIXELS_SIZE);
+    OF_MEMBER(square_sums, 2 * ROW_BLOCKS);
+    OF_MEMBER(slope, PIXELS_SIZE);
+    OF_MEMBER(curvature, PIXELS_SIZE);
+    OF_MEMBER(steps, N_NUMBERS);
     FOR_EACH_BLOCK_IF(steps[GOING], block, ROW_BLOCKS) {
         const size_t at = (size_t)block * NX * 2 * SIDE;
         read_tiles(z, spectra, block);
@@ -88,6 +94,9 @@ KERNEL void scale_rows(
         write_tiles(spectra, z, block, 1);
     }
     if (get_group_id(0) == 0) {
+        OF_MEMBER(star_fluxes, n_stars);
+        OF_MEMBER(star_corrections, n_stars);
+        OF_MEMBER(prior_fluxes, n_stars);
         FOR_EACH(s, steps[GOING] != 0 ? n_stars : 0) {
             const real flux = star_fluxes[s], known = prior_precision[s] / star_weights[s];
             star_fluxes[s] =

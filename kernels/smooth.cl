@@ -126,6 +126,11 @@ KERNEL void smooth(
     const int has_smoothing_map, const real smoothing, const real edge)
 {
     SHARED_SUMS(shared);
+    OF_MEMBER(slope, PIXELS_SIZE);
+    OF_MEMBER(curvature, PIXELS_SIZE);
+    OF_MEMBER(smooth_sums, 2 * ROW_BLOCKS);
+    OF_MEMBER(extended, PIXELS_SIZE);
+    OF_MEMBER(steps, N_NUMBERS);
     FOR_EACH_BLOCK_IF(steps[GOING], block, ROW_BLOCKS) {
         vec_sum total;
         if (has_smoothing_map)

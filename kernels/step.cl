@@ -30,7 +30,7 @@ INLINE cvec scaling_at(
 /* gradient' = mu f + slope - c, c = sum_j A_j^T (r_j - w_j);
  * change_sums: <D y, s> and <D y, D y>, y = gradient' - gradient, s = f - previous,
  * D = (f + shift) a / (1 + (mu + curvature) (f + shift) a), a = 1 / sum_j A_j^T w_j.
- * spectra: one array, const, row spectrum of c. gradient: one array of pixels, updated. extended
+ * spectra: n_images arrays, const, of which array 0 is the row spectrum of c. gradient: one array of pixels, updated. extended
  * (f), previous, shift: one each, const. inverse_weight: one array of pixels, a (has_weights), or
  * one point, [2][BLOCK], for all. slope, curvature: one array of pixels each, const, those of f (is_smoothed;
  * else they count as 0). change_sums: [2][ROW_BLOCKS][2]. steps[FRESH] 0: nothing.
@@ -42,11 +42,19 @@ KERNEL void gradient_rows(
     __global const vec *restrict previous, __global const vec *restrict shift,
     __global const vec *restrict inverse_weight, __global const vec *restrict slope,
     __global const vec *restrict curvature, __global const real *restrict steps,
-    const int has_weights, const int is_smoothed, const real mu,
+    const int has_weights, const int is_smoothed, const real mu, const int n_images,
     __global const real *restrict row_roots, SCRATCH vec *restrict scratch)
 {
     SHARED_SUMS(shared);
     SCRATCH vec *z = OWN_SCRATCH(scratch, NX);
+    OF_MEMBER(spectra, (size_t)n_images * SPECTRA_SIZE);
+    OF_MEMBER(change_sums, 4 * ROW_BLOCKS);
+    OF_MEMBER(gradient, PIXELS_SIZE);
+    OF_MEMBER(extended, PIXELS_SIZE);
+    OF_MEMBER(previous, PIXELS_SIZE);
+    OF_MEMBER(slope, PIXELS_SIZE);
+    OF_MEMBER(curvature, PIXELS_SIZE);
+    OF_MEMBER(steps, N_NUMBERS);
     FOR_EACH_BLOCK_IF(steps[FRESH], block, ROW_BLOCKS) {
         const size_t at = (size_t)block * NX * 2 * SIDE;
         read_tiles(z, spectra, block);
@@ -80,7 +88,7 @@ KERNEL void gradient_rows(
  * last step was refused f <- previous + SHORTER (f - previous) instead, which shortens d.
  * spectra <- row spectrum of f; step_sums: <gradient, d>;
  * coupling_sums: <cross_information_s, d>; square_sums: sum f^2.
- * spectra: one array, out: twice the row spectrum. extended (f): one array of pixels, updated.
+ * spectra: n_images arrays, of which array 0 is out: twice the row spectrum. extended (f): one array of pixels, updated.
  * previous: one, written, or read. gradient, shift: one each, const; inverse_weight, curvature: as
  * for gradient_rows, which has D and change_sums. steps[GOING] 0: nothing.
  * cross_information: [n_stars], a window of cross_blocks blocks and cross_columns columns each;
@@ -98,11 +106,21 @@ KERNEL void step_rows(
     __global const vec *restrict cross_information, __global const int *restrict cross_corners,
     __global const int *restrict cross_near, __global const real *restrict steps,
     __global const real *restrict change_sums, const int has_weights, const int is_smoothed,
-    const real mu, const int cross_blocks, const int cross_columns,
-    __global const real *restrict row_roots, SCRATCH vec *restrict scratch)
+    const real mu, const int n_images, const int n_stars, const int cross_blocks,
+    const int cross_columns, __global const real *restrict row_roots, SCRATCH vec *restrict scratch)
 {
     SHARED_SUMS(shared);
     SCRATCH vec *z = OWN_SCRATCH(scratch, NX);
+    OF_MEMBER(spectra, (size_t)n_images * SPECTRA_SIZE);
+    OF_MEMBER(extended, PIXELS_SIZE);
+    OF_MEMBER(step_sums, 2 * ROW_BLOCKS);
+    OF_MEMBER(coupling_sums, n_stars * cross_blocks * 2);
+    OF_MEMBER(square_sums, 2 * ROW_BLOCKS);
+    OF_MEMBER(previous, PIXELS_SIZE);
+    OF_MEMBER(gradient, PIXELS_SIZE);
+    OF_MEMBER(curvature, PIXELS_SIZE);
+    OF_MEMBER(steps, N_NUMBERS);
+    OF_MEMBER(change_sums, 4 * ROW_BLOCKS);
     const real alpha = next_alpha(steps, next_length(steps, change_sums, shared));
     const bool is_new = steps[SHORTENED] == 0;
     FOR_EACH_BLOCK_IF(steps[GOING], block, ROW_BLOCKS) {

@@ -12,6 +12,9 @@ KERNEL void transmit_rows(
     const int n_images, __global const real *restrict row_roots, SCRATCH vec *restrict scratch)
 {
     SCRATCH vec *z = OWN_SCRATCH(scratch, NX);
+    OF_MEMBER(spectra, (size_t)n_images * SPECTRA_SIZE);
+    OF_MEMBER(extended, PIXELS_SIZE);
+    OF_MEMBER(steps, N_NUMBERS);
     FOR_EACH_BLOCK_IF(steps[GOING], block, ROW_BLOCKS) {
         const size_t at = (size_t)block * NX * 2 * SIDE;
         for (int image = 0; image < n_images; ++image) {
@@ -46,6 +49,9 @@ KERNEL void gather_rows(
 {
     const real norm = (real)1 / 2 / NX;
     SCRATCH vec *z = OWN_SCRATCH(scratch, NX);
+    OF_MEMBER(spectra, (size_t)n_images * SPECTRA_SIZE);
+    OF_MEMBER(transmitted, PIXELS_SIZE);
+    OF_MEMBER(steps, N_NUMBERS);
     FOR_EACH_BLOCK_IF(steps[FRESH], block, ROW_BLOCKS) {
         const size_t at = (size_t)block * NX * 2 * SIDE;
         for (int image = 0; image < n_images; ++image) {

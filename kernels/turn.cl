@@ -58,7 +58,8 @@ INLINE int in_row(const int x)
 /* sampled = sum_k weights_ik given(firsts_i + k), 0 <= k < TURN_TAPS, for each line i, round the end: lines
  * in the steps of larger pixels, or the adjoint.
  * sampled, given: arrays [parts][stride][length] of vectors, of which lines, a multiple of RUN, are
- * taken; of the const one that of a number is read. firsts: [..][lines], 0 to lines - 1, and weights,
+ * taken; that of number `array` is read, that of number `to` written; a member has sampled_size and
+ * given_size reals. firsts: [..][lines], 0 to lines - 1, and weights,
  * [..][lines][TURN_TAPS]: from line `table` on. Here and in the kernels below steps[GOING] 0: nothing.
  * Launch: up to parts * lines / RUN groups. Out of place. Twin: reference.sample_lines.
  */
@@ -66,9 +67,14 @@ KERNEL void sample_lines(
     __global vec *restrict sampled, __global const vec *restrict given, const int array,
     __global const int *restrict firsts, __global const real *restrict weights,
     __global const real *restrict steps, const int table, const int parts, const int lines,
-    const int stride, const int length)
+    const int stride, const int length, const int to, const ulong sampled_size,
+    const ulong given_size)
 {
     const int runs = lines / RUN;
+    OF_MEMBER(sampled, sampled_size / LANES);
+    OF_MEMBER(given, given_size / LANES);
+    OF_MEMBER(steps, N_NUMBERS);
+    sampled += (size_t)to * parts * stride * length;
     given += (size_t)array * parts * stride * length;
     FOR_EACH_BLOCK_IF(steps[GOING], run, parts * runs) {
         const size_t part = (size_t)(run / runs) * stride * length;
@@ -130,10 +136,14 @@ INLINE void load_columns(
  */
 KERNEL void irfft_sheared(
     __global real *restrict columns, __global const vec *restrict spectra,
-    __global const real *restrict steps, const int image, const int count,
-    __global const real *restrict row_roots, SCRATCH vec *restrict scratch)
+    __global const real *restrict steps, const int image, const int count, const ulong columns_size,
+    const ulong spectra_size, __global const real *restrict row_roots,
+    SCRATCH vec *restrict scratch)
 {
     SCRATCH vec *z = OWN_SCRATCH(scratch, 2 * TURN_POINTS);
+    OF_MEMBER(columns, columns_size);
+    OF_MEMBER(spectra, spectra_size / LANES);
+    OF_MEMBER(steps, N_NUMBERS);
     FOR_EACH_BLOCK_IF(steps[GOING], unit, count * ROW_BLOCKS) {
         const int block = unit % ROW_BLOCKS, place = unit / ROW_BLOCKS;
         __global real *own = columns + place * COLUMNS_SIZE;
@@ -171,11 +181,19 @@ KERNEL void ratio_sheared(
     const int has_background_map, __global const vec *restrict exposure, const int has_exposure_map,
     __global const vec *restrict star_images, __global const int *restrict star_corners,
     __global const int *restrict star_near, __global const real *restrict star_fluxes,
-    __global const real *restrict steps, const int n_images, const int star_blocks,
-    const int star_columns, SCRATCH vec *restrict scratch)
+    __global const real *restrict steps, const int n_images, const int n_stars,
+    const int star_blocks, const int star_columns, const ulong ratio_columns_size,
+    const ulong columns_size, SCRATCH vec *restrict scratch)
 {
     SHARED_SUMS(shared);
     SCRATCH vec *sheared = OWN_SCRATCH(scratch, 2 * TURN_POINTS);
+    OF_MEMBER(ratio_columns, ratio_columns_size);
+    OF_MEMBER(columns, columns_size);
+    OF_MEMBER(ratio_sums, IMAGE_ROW_BLOCKS * n_images * 2);
+    OF_MEMBER(star_sums, (size_t)n_stars * n_images * star_blocks * 2);
+    OF_MEMBER(images, (size_t)n_images * IMAGE_SIZE);
+    OF_MEMBER(star_fluxes, n_stars);
+    OF_MEMBER(steps, N_NUMBERS);
     SCRATCH vec *wide = sheared + 2 * SIDE * TURN_POINTS;
     SCRATCH vec *z = wide + 2 * SIDE * TURN_MARGIN;
     FOR_EACH_BLOCK_IF(steps[GOING], unit, count * image_blocks) {
@@ -237,9 +255,13 @@ KERNEL void ratio_sheared(
 KERNEL void unshear_columns(
     __global real *restrict columns, __global const real *restrict ratio_columns,
     __global const int *restrict column_shifts, __global const real *restrict column_weights,
-    __global const real *restrict steps, const int image, SCRATCH vec *restrict scratch)
+    __global const real *restrict steps, const int image, const ulong columns_size,
+    const ulong ratio_columns_size, SCRATCH vec *restrict scratch)
 {
     SCRATCH vec *z = OWN_SCRATCH(scratch, 2 * TURN_POINTS);
+    OF_MEMBER(columns, columns_size);
+    OF_MEMBER(ratio_columns, ratio_columns_size);
+    OF_MEMBER(steps, N_NUMBERS);
     FOR_EACH_BLOCK_IF(steps[GOING], block, ROW_BLOCKS) {
         load_columns(
             z, ratio_columns, column_shifts + image * NX, column_weights + image * NX * TURN_TAPS,
@@ -260,10 +282,14 @@ KERNEL void unshear_columns(
 KERNEL void rfft_sheared(
     __global vec *restrict spectra, __global const real *restrict ratio_columns,
     __global const int *restrict column_shifts, __global const real *restrict column_weights,
-    __global const real *restrict steps, const int image, const int count,
-    __global const real *restrict row_roots, SCRATCH vec *restrict scratch)
+    __global const real *restrict steps, const int image, const int count, const ulong spectra_size,
+    const ulong ratio_columns_size, __global const real *restrict row_roots,
+    SCRATCH vec *restrict scratch)
 {
     SCRATCH vec *z = OWN_SCRATCH(scratch, 2 * TURN_POINTS);
+    OF_MEMBER(spectra, spectra_size / LANES);
+    OF_MEMBER(ratio_columns, ratio_columns_size);
+    OF_MEMBER(steps, N_NUMBERS);
     FOR_EACH_BLOCK_IF(steps[GOING], unit, count * ROW_BLOCKS) {
         const int block = unit % ROW_BLOCKS, place = unit / ROW_BLOCKS, turn = image + place;
         load_columns(

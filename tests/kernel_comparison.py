@@ -181,11 +181,12 @@ def _run_convolve_columns(harness: KernelHarness, given: SimpleNamespace) -> Pai
     oversample, phases = harness.program.oversample, _phases(given)
     expected = reference.convolve_columns(given.spectrum[0], given.otfs, oversample, phases)
     yield harness.take_image_spectra(out, given.p), _real_edges(expected)
-    # An image that has a sky of its own.
-    alone = {"first": given.p - 1, "n_images": 1}
-    out = harness.put_spectra([*others, *given.spectrum])
-    harness.launch("convolve_columns", spectra=out, **alone, **_put_otfs(harness, given))
-    yield harness.take_image_spectra(out, given.p)[-1], expected[-1]
+    # Images that have skies of their own.
+    skies = rounded(np.arange(1, given.p + 1)[:, None, None] * given.spectrum, harness.dtype)
+    out = harness.put_spectra(skies)
+    harness.launch("convolve_columns", spectra=out, has_skies=1, **_put_otfs(harness, given))
+    expected = reference.convolve_columns(skies, given.otfs, oversample, phases)
+    yield harness.take_image_spectra(out, given.p), _real_edges(expected)
 
 
 def _run_correlate_columns(harness: KernelHarness, given: SimpleNamespace) -> Pairs:
@@ -197,13 +198,15 @@ def _run_correlate_columns(harness: KernelHarness, given: SimpleNamespace) -> Pa
     others = harness.take_image_spectra(out, given.p)[1:]
     if not np.array_equal(others, _real_edges(given.image_spectra[1:])):
         raise DeviceError("others than array 0 are written")
-    out = harness.put_spectra(given.image_spectra)
-    last = slice(given.p - 1, given.p)
-    alone = {"first": last.start, "n_images": 1}
-    harness.launch("correlate_columns", spectra=out, **alone, **_put_otfs(harness, given))
-    phases = _phases(given)
-    own = given.image_spectra[last], given.otfs[last], None if phases is None else phases[last]
-    yield harness.take_spectra(out, given.p)[-1], _real_edges(reference.correlate_columns(*own))
+    out, phases = harness.put_spectra(given.image_spectra), _phases(given)
+    harness.launch("correlate_columns", spectra=out, has_skies=1, **_put_otfs(harness, given))
+    own = [
+        reference.correlate_columns(
+            given.image_spectra[j], given.otfs[j], None if phases is None else phases[j]
+        )
+        for j in (slice(k, k + 1) for k in range(given.p))
+    ]
+    yield harness.take_spectra(out, given.p), _real_edges(np.array(own))
 
 
 def _run_transmit_rows(harness: KernelHarness, given: SimpleNamespace) -> Pairs:

@@ -18,7 +18,6 @@ from lnocl.core.opencl.shears import Shears
 from lnocl.core.opencl.tuning import Tuning
 from lnocl.core.opencl.windows import stars_near
 from lnocl.core.scene.rotation import Rotation
-from lnocl.core.scene.scene import MIN_MODEL
 from lnocl.core.scene.steps import Steps
 from lnocl.errors import DeviceError
 
@@ -179,7 +178,7 @@ class KernelHarness:
     ) -> None:
         self.n_images, self.n_stars = scene.get("n_images", 1), scene.get("n_stars", 0)
         parts = {name: has for name, has in scene.items() if name not in ARGUMENTS}
-        self.program = Program(context, grid, np.dtype(dtype), tuning, min_model=MIN_MODEL, **parts)
+        self.program = Program(context, grid, np.dtype(dtype), tuning, **parts)
         self.layout, self.launcher = SpectraLayout(self.program), Launcher(self.program)
         self.dtype, self.grid, self.scene = self.program.dtype, grid, scene
         self.image_grid = self.program.image_grid
@@ -205,15 +204,15 @@ class KernelHarness:
 
         Arguments that the scene has no use for are small arrays.
         """
-        counts = {"n_images": self.n_images, "n_stars": self.n_stars, "first": 0}
+        counts = {"n_images": self.n_images, "n_stars": self.n_stars, "has_skies": 0}
         counts |= {
             "is_smoothed": int(self.scene.get("has_smoothing", False)),
             **{name: int(self.scene.get(name, False)) for name in MAPS},
         }
         given = {**counts, "steps": self.put(Steps().numbers()), **arguments}
-        for name in self.program.arguments[kernel]:
+        for name, kind in self.program.arguments[kernel].items():
             if name not in given and name not in self.launcher.own:
-                given[name] = self.put(np.zeros(2))
+                given[name] = self.put(np.zeros(2)) if "*" in kind else 0
         self.launcher.bind(kernel, given)()
 
     def forget(self) -> None:

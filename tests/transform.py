@@ -11,6 +11,7 @@ from lnocl.core.opencl.launch import READ_WRITE, Launch, Launcher
 from lnocl.core.opencl.layout import reversed_order
 from lnocl.core.opencl.program import Program
 from lnocl.core.opencl.tuning import Tuning
+from lnocl.core.scene.steps import Steps
 
 
 class Transform:
@@ -40,6 +41,8 @@ class Transform:
         self.launcher = Launcher(self.program)
         self._pixels = cl.Buffer(context, READ_WRITE, self.layout.pixels_bytes)
         self._spectra = cl.Buffer(context, READ_WRITE, self.layout.spectra_bytes)
+        going = Steps().numbers().astype(self.program.dtype)
+        self._steps = cl.Buffer(context, READ_WRITE | cl.mem_flags.COPY_HOST_PTR, hostbuf=going)
 
     def fft(self, columns: NDArray) -> NDArray[np.complex128]:
         """Return ``sum_y F(y) exp(-2 pi i k y / Ny)`` of each of (Ny, Nx / 2) complex columns."""
@@ -81,7 +84,9 @@ class Transform:
         self._bind("ifft_columns")()
 
     def _bind(self, name: str) -> Launch:
-        return self.launcher.bind(name, spectra=self._spectra, pixels=self._pixels)
+        return self.launcher.bind(
+            name, spectra=self._spectra, pixels=self._pixels, steps=self._steps, n_images=1
+        )
 
     def _upload(self, buffer: cl.Buffer, packed: NDArray) -> None:
         cl.enqueue_copy(self.launcher.queue, buffer, packed)

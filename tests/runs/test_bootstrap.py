@@ -111,13 +111,25 @@ def test_replicas_hang_on_seed_and_number_alone():
     for k in (3, 0):
         first.reconstruct(k)
     for k in (0, 3):
-        pairs = zip(first.reconstruct(k)[:2], second.reconstruct(k)[:2], strict=True)
-        for found, expected in pairs:
-            for a, b in zip(found, expected, strict=True):
-                np.testing.assert_array_equal(a, b)
-    different = Replicas(outcome, 6).reconstruct(0)[0].extended
-    assert (different != second.reconstruct(0)[0].extended).any()
-    assert (different != second.reconstruct(1)[0].extended).any()
+        same(*first.reconstruct(k), *second.reconstruct(k))
+    different = Replicas(outcome, 6).reconstruct(0)[0][0].extended
+    assert (different != second.reconstruct(0)[0][0].extended).any()
+    assert (different != second.reconstruct(1)[0][0].extended).any()
+
+
+def same(one, other):
+    for found, expected in zip(one[:2], other[:2], strict=True):
+        for a, b in zip(found, expected, strict=True):
+            np.testing.assert_array_equal(a, b)
+
+
+@pytest.mark.parametrize("engine", ["numpy", "opencl"])
+def test_replicas_of_a_batch_are_bit_for_bit_as_alone(engine):
+    outcome = solved(engine=engine)._outcome
+    alone, batch = Replicas(outcome, 5), Replicas(outcome, 5, 3)
+    for numbers in ((3, 0, 1), (4, 2)):
+        for k, replica in zip(numbers, batch.reconstruct(*numbers), strict=True):
+            same(replica, *alone.reconstruct(k))
 
 
 # --- The prior of star fluxes
@@ -136,7 +148,7 @@ def test_a_repeated_run_heeds_the_prior_that_it_is_given():
     outcome = told(np.array([1e-3]))
     counts = outcome.scene.observation.images
     fluxes = 1.1 * outcome.star_fluxes
-    found = Repeated(outcome).of(counts, StarPrior.of(fluxes, np.array([1e-3])))
+    found = Repeated(outcome).of((counts, StarPrior.of(fluxes, np.array([1e-3]))))[0]
     np.testing.assert_allclose(found.star_fluxes, fluxes, rtol=1e-3)
 
 
@@ -147,7 +159,7 @@ def test_each_replica_has_a_prior_that_is_drawn_about_its_truth(monkeypatch):
     replicas = Replicas(outcome, 0)
     for k in range(12):
         replicas.reconstruct(k)
-    pulls = np.array([prior.fluxes - outcome.star_fluxes for prior in seen]) / 20.0
+    pulls = np.array([prior.fluxes - outcome.star_fluxes for _, prior in seen]) / 20.0
     assert len(np.unique(pulls)) == 12
     assert 0.5 < pulls.std() < 1.7
     assert abs(pulls.mean()) < 3 / np.sqrt(12)
@@ -200,7 +212,7 @@ def test_light_is_there_in_the_replicas_whose_errors_leave_some():
 def test_pixels_have_light_where_they_are_brighter_than_their_errors():
     outcome = solved()._outcome
     found = run_bootstrap(outcome, 10)
-    replicas = [Replicas(outcome, 7).reconstruct(k) for k in range(10)]
+    replicas = [Replicas(outcome, 7).reconstruct(k)[0] for k in range(10)]
     width = found.resolution / np.sqrt(8 * np.log(2))
     answer = gaussian_filter(outcome.sky[:32, :32], width, mode="nearest")
     there = [
@@ -220,7 +232,7 @@ def test_errors_are_found_less_drawn():
     ]  # fmt: skip
     replicas = Replicas(outcome, 7)
     for k in (0, 9):
-        drawn, seen, _ = replicas.reconstruct(k)
+        drawn, seen, _ = replicas.reconstruct(k)[0]
         flux = seen.star_fluxes[0] - outcome.star_fluxes[0]
         light = (seen.light - drawn.extended)[4:16, 6:18].sum()
         assert found.errors[k, [0, 3]] == pytest.approx([flux, light], rel=1e-9)
@@ -231,7 +243,7 @@ def test_errors_are_found_less_drawn():
     assert found.error_map.shape == found.bias_map.shape == (ny, nx)
     errors = []
     for k in range(10):
-        drawn, seen, _ = replicas.reconstruct(k)
+        drawn, seen, _ = replicas.reconstruct(k)[0]
         # Full width at half maximum in standard deviations.
         smoothed = gaussian_filter(seen.extended - drawn.extended, found.resolution / 2.35482)
         errors.append(smoothed[12:-12, 12:-12])  # the edges aside
@@ -339,7 +351,7 @@ def test_errors_of_psfs_are_told_apart():
             observation, made.stars, stop=None, n_iter=8, smoothing=1e-3, pad=0, engine="numpy"
         )
         found.append(result.bootstrap(12))
-        drawn, seen, wrong = Replicas(result._outcome, 0).reconstruct(11)
+        drawn, seen, wrong = Replicas(result._outcome, 0).reconstruct(11)[0]
         error = wrong.star_fluxes - drawn.star_fluxes
         assert found[-1].errors[11, 0] == pytest.approx(error[0], rel=1e-9)
         of_psfs = wrong.star_fluxes - seen.star_fluxes

@@ -140,7 +140,9 @@ def test_shift_is_that_of_the_whole_grid(stars):
 def test_scaling_is_restored_from_its_state(n_stars):
     made = TINY.make()
     _, _, steps, _ = prepared(made, made.stars[:n_stars], [1e3, 1e3][:n_stars])
-    other = scaling.Scaling.from_state(steps.state())
+    moved = [(x + 1, y) for x, y in made.stars[:n_stars]]
+    _, _, elsewhere, _ = prepared(made, moved, [1e3, 1e3][:n_stars])
+    other = elsewhere.restored(steps.state())
     for name, array in steps.state().items():
         np.testing.assert_array_equal(other.state()[name], array)
     cutouts = zip(other.cross_information, steps.cross_information, strict=True)

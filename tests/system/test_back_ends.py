@@ -48,9 +48,7 @@ def options(grid, scene, dtype):
     oversample = parts.get("oversample", 1)
     cut = of_gpu(*grid, oversample=oversample, dtype=dtype)
     assert cut.group > 1
-    return program.Program(
-        context_of(choose().device), grid, np.dtype(dtype), cut, min_model=1e-6, **parts
-    ).options
+    return program.Program(context_of(choose().device), grid, np.dtype(dtype), cut, **parts).options
 
 
 def compiled(target, given, tmp_path):

@@ -40,7 +40,7 @@ class Engine(Protocol):
     scaling: Scaling | None
 
     def start(self, extended: Array, star_fluxes: Array, recorded: int = 0) -> None:
-        """Begin from this estimate, with so many objectives on the record; add its own.
+        """Begin from this estimate, with so many objectives on the record; add its own, and rest.
 
         Pixels that were not observed are set to 0.
         """
@@ -61,7 +61,10 @@ class Engine(Protocol):
         """
 
     def tick(self) -> None:
-        """Iterate once: make a step, or one shorter than the last, which was refused."""
+        """Iterate once, unless it rests: make a step, or shorten the last, which was refused."""
+
+    def finish(self) -> None:
+        """Tick until it rests; those that share its ticks do too."""
 
     def look(self) -> Steps:
         """Return what was decided; this waits for all ticks."""

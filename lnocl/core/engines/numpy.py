@@ -18,10 +18,9 @@ from lnocl.core.reference.step import gradient_rows, shortened, step_rows
 from lnocl.core.reference.transmit import gather_rows, transmit_rows
 from lnocl.core.reference.turn import irfft_sheared, ratio_sheared, unshear_columns
 from lnocl.core.scene.arrays import Array
-from lnocl.core.scene.forward_model import Model
 from lnocl.core.scene.scene import Scene
 from lnocl.core.scene.steps import STUCK, Steps
-from lnocl.core.solvers.scaling import Scaling
+from lnocl.core.solvers.scaling import Scaling, inverse_weight
 
 
 class ReferenceEngine:
@@ -52,7 +51,9 @@ class ReferenceEngine:
             self._column_shifts = np.array([each.column_shifts for each in rotations])
             self._image_shifts = np.array([each.image_shifts for each in rotations])
         self.move_stars()
-        self._inverse_weight = self._invert_weight()
+        self._inverse_weight = (
+            1.0 / scene.n_images if scene.weights is None else inverse_weight(scene, scaling)
+        )
         self._slope = self._curvature = np.zeros(scene.grid)
 
     def take_images(self) -> None:
@@ -73,14 +74,6 @@ class ReferenceEngine:
             [[scene.star_image(j, s) for j in range(scene.n_images)] for s in range(scene.n_fluxes)]
         ).reshape(scene.n_fluxes, *self._images.shape)
 
-    def _invert_weight(self) -> Array | float:
-        if self.scene.weights is None:
-            return 1.0 / self.scene.n_images
-        model = Model(self.scene)
-        total = model.adjoint(model.weights)
-        observed = self.scene.observed(total)
-        return np.divide(1.0, total, out=np.zeros_like(total), where=observed)
-
     def start(self, extended: Array, star_fluxes: Array, recorded: int = 0) -> None:
         """Begin from this estimate, with so many objectives on the record; add its own."""
         self._extended = np.where(np.asarray(self._inverse_weight) > 0, extended, 0.0)
@@ -90,6 +83,7 @@ class ReferenceEngine:
         self._objectives = self._objectives[:recorded]
         self._judge_estimate(Steps(recorded=recorded))
         self._make_gradient()
+        self._steps.going = self._steps.fresh = 0.0
 
     def _judge_estimate(self, steps: Steps) -> None:
         """Make the ratios of an estimate from elsewhere, and record its objective."""
@@ -115,6 +109,11 @@ class ReferenceEngine:
         self._step()
         self._ratio()
         self._make_gradient()
+
+    def finish(self) -> None:
+        """Tick until it rests."""
+        while self._steps.going:
+            self.tick()
 
     def look(self) -> Steps:
         """Return what was decided."""

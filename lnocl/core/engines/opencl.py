@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
+from copy import copy
 from dataclasses import replace
 
 import numpy as np
@@ -22,18 +23,17 @@ from lnocl.core.opencl.device import choose, context_of, describe, tell
 from lnocl.core.opencl.faults import guarded
 from lnocl.core.opencl.launch import Launch, Launcher
 from lnocl.core.opencl.layout import Layout
-from lnocl.core.opencl.memory import Memory, announce, refuse_if_too_large
+from lnocl.core.opencl.memory import Memory, announce, of_all, refuse_if_too_large
 from lnocl.core.opencl.program import Program
-from lnocl.core.opencl.transmitted import TransmittedSky
 from lnocl.core.opencl.tuning import Tuning, describe_tuning
 from lnocl.core.opencl.turned import TurnedImages
 from lnocl.core.opencl.windows import StarWindows
 from lnocl.core.scene.arrays import Array
 from lnocl.core.scene.camera import spread
-from lnocl.core.scene.scene import MIN_MODEL, Scene
+from lnocl.core.scene.scene import Scene
 from lnocl.core.scene.stars import covered_box
 from lnocl.core.scene.steps import STUCK, Steps
-from lnocl.core.solvers.scaling import Scaling
+from lnocl.core.solvers.scaling import Scaling, inverse_weight
 
 # What the images hold where a pixel was not observed.
 UNSEEN = -1.0
@@ -62,8 +62,11 @@ class OpenCLEngine:
         By default that of `lnocl.core.opencl.tuning.tune`.
     scaling : Scaling, optional
         For the scaled gradient projection method.
-    half : {0, 1}, optional
-        Which half of the counts the scene is of, where both are on the device.
+    n_members : int, optional
+        Members of a batch, of which this is the first, and `member` returns the others.
+    n_in_all : int, optional
+        Members of all engines that the device is to hold, for which room is asked and announced; 0
+        where that was done.
 
     Raises
     ------
@@ -82,7 +85,8 @@ class OpenCLEngine:
         n_iter: int,
         tuning: Tuning | None = None,
         scaling: Scaling | None = None,
-        half: int | None = None,
+        n_members: int = 1,
+        n_in_all: int = 1,
     ) -> None:
         self.name, self.bytes_needed = "the device", 0
         self.is_proven = self._has_ticked = False  # every kernel of an iteration was launched
@@ -98,7 +102,6 @@ class OpenCLEngine:
             tuning,
             oversample=1 if scene.rotations else scene.oversample,
             has_turns=bool(scene.rotations),
-            min_model=MIN_MODEL,
         )
         self._first = Steps(rounding=ROUNDING) if precision == "single" else Steps()
         self.layout = Layout(self.program)
@@ -118,29 +121,38 @@ class OpenCLEngine:
             sizes |= self._turned.sizes()
         if scaling is not None:
             sizes |= scaling_sizes(scene, self.program, self.layout, self._cross)
-        self.bytes_needed = refuse_if_too_large(
-            chosen,
-            {**sizes, "scratch and roots": Launcher.bytes_needed(self.program)},
-            1 if half is None else 2,
-        )
-        if half != 1:
-            dtype, halves = self.program.dtype, half == 0
+        with_launcher = of_all(sizes | Launcher.sizes(self.program), n_members)
+        n_engines = n_in_all // n_members
+        self.bytes_needed = refuse_if_too_large(chosen, with_launcher, n_engines)
+        if n_engines:
             of_device = self.bytes_needed if chosen.type & cl.device_type.CPU else 0
             announce(
                 chosen,
-                (1 + halves) * self.bytes_needed,
-                host_bytes(scene, scaling, of_device, self.program, halves),
-                describe_tuning(chosen, dtype, self.program.tuning),
+                n_engines * self.bytes_needed,
+                host_bytes(scene, scaling, of_device, self.program, n_in_all > 1),
+                describe_tuning(chosen, self.program.dtype, self.program.tuning),
             )
-        self._launcher = Launcher(self.program)
+        self._launcher = Launcher(self.program, n_members)
         self._queue = self._launcher.queue
-        self._memory = Memory(self._queue, self.layout, scene.scale)
+        self._memory = Memory(self._queue, self.layout, scene.scale, n_members)
         self._observed: NDArray[np.bool_] | None = None
         self._memory.allocate(**sizes)
+        # What was decided for each member, which all share; empty where that is not known.
+        self._member, self._decided = 0, [Steps(going=0.0) for _ in range(n_members)]
         self._upload_scene()
         self._bind_iteration()
         if scaling is not None:
             self._upload_scaling(scaling)
+
+    def member(self, k: int, scene: Scene) -> OpenCLEngine:
+        """Return another member of the batch, whose scene differs in its images alone.
+
+        It shares the device's ticks and all other arrays; a member that rests is left as it is.
+        """
+        other = copy(self)
+        other.scene, other._member, other._memory = scene, k, self._memory.of(k)
+        other.take_images()
+        return other
 
     @property
     def _spacing(self) -> int:
@@ -162,6 +174,7 @@ class OpenCLEngine:
             "star_columns": self._stars.n_columns,
             "cross_blocks": self._cross.n_blocks,
             "cross_columns": self._cross.n_columns,
+            "has_skies": int(scene.transmission is not None),
             "has_weights": int(scene.weights is not None),
             "has_background_map": int(has_background_map(scene)),
             "has_exposure_map": int(scene.has_exposure_map),
@@ -171,20 +184,22 @@ class OpenCLEngine:
             "smoothing": scene.smoothing,
             "edge": scene.edge,
             "image": 0,
-            "first": 0,
             "image_blocks": -(-rows // (2 * self.program.tuning.block)),  # that hold some of these
         }
-        return self._launcher.bind(name, {**self._memory.buffers, **numbers}, **others)
+        sizes = {f"{each}_size": self._memory.count(each) for each in self._memory.buffers}
+        return self._launcher.bind(name, {**self._memory.buffers, **sizes, **numbers}, **others)
+
+    def _bind_all(self, *names: str) -> Callable[[], object]:
+        launches = list(map(self._bind, names))
+        return lambda: [launch() for launch in launches]
 
     def _bind_iteration(self) -> None:
         """Bind the kernels of an iteration, in its order."""
-        self._convolve: Callable[[], object] = self._bind("convolve_columns")
-        self._correlate: Callable[[], object] = self._bind("correlate_columns")
-        if self.scene.transmission is not None:
-            seen = TransmittedSky(self._bind, self.scene.n_images)
-            self._convolve, self._correlate = seen.convolve, seen.correlate
+        has_skies = self.scene.transmission is not None
+        self._convolve = self._bind_all(*["transmit_rows"] * has_skies, "convolve_columns")
+        self._correlate = self._bind_all("correlate_columns", *["gather_rows"] * has_skies)
         if self._turned:
-            self._turned.bind(self._bind, self._memory, self._queue)
+            self._turned.bind(self._bind, self._memory)
             self._compare: Callable[[], object] = self._turned.make_ratios
         else:
             self._compare = self._bind("ratio_rows")
@@ -195,10 +210,10 @@ class OpenCLEngine:
 
     def _upload_scene(self) -> None:
         scene, memory = self.scene, self._memory
-        self._set(Steps())
+        memory.clear("steps", of_all=True)
         if self._turned:
             self._turned.upload(memory)
-        memory.clear("star_sums")  # in images that do not show a star they stay 0
+        memory.clear("star_sums", of_all=True)  # in images that do not show a star they stay 0
         self.take_images()
         has_map = scene.weights is not None and scene.has_exposure_map
         self._upload_map("exposure", np.asarray(scene.weights if has_map else [1.0]), 0.0)
@@ -207,14 +222,18 @@ class OpenCLEngine:
             memory.upload_pixels("smoothing_map", [scene.smoothing_map])
         if scene.transmission is not None:
             memory.upload_pixels("transmission", scene.transmission)
+        self._set(Steps())
         self._make_otfs()
-        memory.upload_integers("star_corners", self._stars.corners)
-        memory.upload_integers("star_near", self._stars.near)
+        self._set(Steps(going=0.0))
+        memory.upload_raw("star_corners", self._stars.corners)
+        memory.upload_raw("star_near", self._stars.near)
         self.move_stars()
         if scene.weights is None:
             memory.upload_points("inverse_weight", np.array([1.0 / scene.n_images]))
         else:
-            self._invert(self._total_weight(scene.weights))
+            inverse = inverse_weight(scene, self.scaling)
+            self._observed = inverse > 0
+            memory.upload_pixels("inverse_weight", [inverse])
 
     def _upload_map(self, name: str, values: Array, beside: float) -> None:
         """Copy images to a buffer, or a value for each."""
@@ -253,8 +272,8 @@ class OpenCLEngine:
             "cross_information",
             (self._cross.cut(s, 0, each) for s, each in enumerate(scaling.cross_information)),
         )
-        self._memory.upload_integers("cross_corners", self._cross.corners)
-        self._memory.upload_integers("cross_near", self._cross.near)
+        self._memory.upload_raw("cross_corners", self._cross.corners)
+        self._memory.upload_raw("cross_near", self._cross.near)
         inverse = scaling.star_information.solve(np.eye(self.scene.n_fluxes))
         self._memory.upload("star_inverse", inverse)
         self._gradient, self._step = self._bind("gradient_rows"), self._bind("step_rows")
@@ -282,36 +301,10 @@ class OpenCLEngine:
             otf.set(image=j)
             otf()
 
-    def _total_weight(self, weights: NDArray) -> Array:
-        """Return sum_j A_j^T w_j."""
-        scene = self.scene
-        # rfft_rows takes no images of other pixels.
-        if scene.oversample > 1 or self._turned or scene.transmission is not None:
-            from lnocl.core.scene.forward_model import Model  # which loads scipy
-
-            model = Model(scene)
-            return model.adjoint(model.weights)
-        spectra, size = self._memory.buffers["spectra"], self.layout.spectra_bytes
-        transform = self._bind("rfft_rows", pixels=self._memory.buffers["extended"])
-        for j in reversed(range(len(weights))):
-            if j == len(weights) - 1 or weights.strides[0]:  # else all images share them
-                self._memory.upload_pixels("extended", [weights[j]])
-                transform()
-            if j > 0:  # the first array is where transforms come out
-                cl.enqueue_copy(self._queue, spectra, spectra, byte_count=size, dst_offset=j * size)
-        self._bind("correlate_columns")()
-        self._bind("irfft_rows", pixels=self._memory.buffers["extended"])()
-        return self.extended().astype(np.float64)
-
-    def _invert(self, total: Array) -> None:
-        """Make 1 / sum_j A_j^T w_j, 0 where nothing was observed."""
-        self._observed = self.scene.observed(total)
-        inverse = np.divide(1.0, total, out=np.zeros_like(total), where=self._observed)
-        self._memory.upload_pixels("inverse_weight", [inverse])
-
     def start(self, extended: Array, star_fluxes: Array, recorded: int = 0) -> None:
-        """Begin from this estimate, with so many objectives on the record; add its own."""
+        """Begin from this estimate, with so many objectives on the record; add its own; rest."""
         memory = self._memory
+        self.finish()  # as what is launched here is launched for other members too
         if self._observed is not None:
             extended = np.where(self._observed, extended, 0.0)
         memory.upload_pixels("extended", [extended])
@@ -324,6 +317,7 @@ class OpenCLEngine:
             memory.clear("gradient")
             self._correlate()
             self._gradient()
+        memory.upload("steps", np.zeros(2))  # of which the first two are going and fresh
 
     def _judge_estimate(self, steps: Steps) -> None:
         """Make the ratios of an estimate that came from the host, and record its objective."""
@@ -335,12 +329,13 @@ class OpenCLEngine:
         self._ratio()
 
     def _set(self, steps: Steps) -> None:
-        self._steps, self._is_known = steps, True
+        if self._decided:  # else it is downloaded with those of the other members
+            self._decided[self._member] = steps
         self._memory.upload_raw("steps", steps.numbers().astype(self.program.dtype))
 
     def _ratio(self) -> None:
         """Make the ratios of the estimate; judge its objective."""
-        self._is_known = False
+        self._decided.clear()
         self._compare()
         if self.scene.is_smoothed:
             self._smooth()
@@ -349,7 +344,14 @@ class OpenCLEngine:
     def go_on(self, target: int, tolerance: float) -> None:
         """Let ticks go on until so many objectives are recorded, or have settled."""
         going = {"going": 1.0, "fresh": 1.0, "target": target, "tolerance": tolerance}
-        self._set(replace(self._steps, **going))
+        self._set(replace(self.look(), **going))
+
+    def finish(self) -> None:
+        """Tick until no member of the batch goes on."""
+        while going := [steps for steps in self._decisions() if steps.going]:
+            n_ticks = max(int(steps.target - steps.recorded) for steps in going)
+            for _ in range(max(n_ticks, 1)):
+                self.tick()
 
     def tick(self) -> None:
         """Iterate once: make a step, or one shorter than the last, which was refused."""
@@ -369,14 +371,20 @@ class OpenCLEngine:
 
     def look(self) -> Steps:
         """Return what was decided; this waits for all ticks."""
-        if self._is_known:
-            return self._steps
-        self._is_known = True
-        self._steps = Steps(*self._memory.download("steps", N_STEPS).tolist())
-        if self._steps.reason == STUCK:
-            self._memory.copy("previous", "extended")
-            self._memory.copy("star_steps", "star_fluxes")
-        return self._steps
+        return self._decisions()[self._member]
+
+    def _decisions(self) -> list[Steps]:
+        """Return what was decided for each member of the batch."""
+        if self._decided:
+            return self._decided
+        n = self._memory.n_members
+        numbers = self._memory.of(0).download("steps", n * N_STEPS).reshape(n, -1)
+        for k, each in enumerate(numbers.tolist()):
+            self._decided.append(Steps(*each))
+            if self._decided[k].reason == STUCK:
+                self._memory.of(k).copy("previous", "extended")
+                self._memory.of(k).copy("star_steps", "star_fluxes")
+        return self._decided
 
     def extended(self) -> NDArray[np.floating]:
         """Return the extended source, on the grid and scaled, in the precision of the device."""
@@ -410,6 +418,7 @@ class OpenCLEngine:
 
     def restore(self, state: State) -> None:
         """Continue from this state."""
+        self.finish()
         for name in self._stateful:
             self._memory.upload_raw(name, state[name])
         steps = Steps(*state["steps"].tolist())

@@ -17,6 +17,8 @@ from lnocl.core.opencl.program import Program
 RUN = 16
 # Stars that a work-group of collect_sums sums up one after the other.
 STARS_A_GROUP = 16
+# Types of arguments that are whole numbers, by words for them in OpenCL.
+WHOLE = {"int": np.int32, "ulong": np.uint64}
 READ_WRITE = cl.mem_flags.READ_WRITE
 
 
@@ -73,7 +75,9 @@ class Launch:
         Buffers, local memory and numbers by the names that the kernel declares; others are
         ignored.
     groups : int
-        Work-groups.
+        Work-groups of each member.
+    n_members : int
+        Members of the batch.
     """
 
     def __init__(
@@ -83,12 +87,13 @@ class Launch:
         name: str,
         arguments: Mapping[str, Any],
         groups: int,
+        n_members: int,
     ) -> None:
         self._queue, self._program, self._name = queue, program, name
         self._types, self._real = program.arguments[name], program.dtype.type
         self._index = {each: index for index, each in enumerate(self._types)}
         group = program.tuning.group
-        self._global_size, self._local_size = (groups * group,), (group,)
+        self._global_size, self._local_size = (groups * group, n_members), (group, 1)
         self._new: dict[int, Any] = {}
         self.set(**{each: arguments[each] for each in self._types})
 
@@ -97,7 +102,8 @@ class Launch:
         for name, value in arguments.items():
             kind = self._types[name]
             if "*" not in kind:
-                value = np.int32(value) if "int" in kind else self._real(value)
+                own = next((each for word, each in WHOLE.items() if word in kind), self._real)
+                value = own(value)
             self._new[self._index[name]] = value
 
     def __call__(self) -> cl.Event:
@@ -116,6 +122,8 @@ class Launcher:
     ----------
     program : Program
         Whose kernels are launched.
+    n_members : int, optional
+        Members of a batch, for all of which each launch is.
 
     Attributes
     ----------
@@ -125,9 +133,9 @@ class Launcher:
         The roots of unity and the scratch, by their names as arguments.
     """
 
-    def __init__(self, program: Program) -> None:
+    def __init__(self, program: Program, n_members: int = 1) -> None:
         context = program.context
-        self.program = program
+        self.program, self._n_members = program, n_members
         self.queue = cl.CommandQueue(context)
         constant = cl.mem_flags.READ_ONLY | cl.mem_flags.COPY_HOST_PTR
         self.own: dict[str, Any] = {
@@ -136,26 +144,25 @@ class Launcher:
         }
         for axis in ("row_roots", "column_roots"):
             self.own.setdefault(f"image_{axis}", self.own[axis])
-        self.own |= {
-            "scratch": (
-                cl.Buffer(context, READ_WRITE, program.max_groups * program.scratch_bytes)
-                if program.tuning.scratch_is_global
-                else cl.LocalMemory(program.scratch_bytes)
-            ),
-        }
+        self.own["scratch"] = (
+            cl.Buffer(context, READ_WRITE, n_members * self.sizes(program)["scratch"])
+            if program.tuning.scratch_is_global
+            else cl.LocalMemory(program.scratch_bytes)
+        )
 
     @staticmethod
-    def bytes_needed(program: Program) -> int:
-        """Return the bytes that a launcher takes on the device."""
+    def sizes(program: Program) -> dict[str, int]:
+        """Return the bytes that a launcher takes on the device, the scratch's for a member."""
         n_roots = sum(map(len, _all_roots(program).values()))
-        return n_roots * program.dtype.itemsize + program.max_groups * program.scratch_bytes
+        scratch = program.max_groups * program.scratch_bytes
+        return {"roots": n_roots * program.dtype.itemsize, "scratch": scratch}
 
     def bind(self, name: str, arguments: Mapping[str, Any] | None = None, **others: Any) -> Launch:
         """Bind a kernel to arguments by name, some of them in a mapping for several kernels."""
         given = {**self.own, **(arguments or {}), **others}
         blocks = self._blocks(name, given)
         groups = min(blocks, self.program.max_groups or blocks)
-        return Launch(self.queue, self.program, name, given, groups)
+        return Launch(self.queue, self.program, name, given, groups, self._n_members)
 
     def _blocks(self, name: str, arguments: Mapping[str, Any]) -> int:
         """Return the number of work-groups that a kernel has work for."""
@@ -172,5 +179,6 @@ class Launcher:
         if name == "ratio_rows":
             return self.program.image_row_blocks * int(arguments["n_images"])
         if name.endswith("_columns"):
-            return self.program.grid[1] // 2 // self.program.tuning.block
+            n_skies = int(arguments["n_images"]) if arguments.get("has_skies") else 1
+            return n_skies * self.program.grid[1] // 2 // self.program.tuning.block
         return self.program.row_blocks

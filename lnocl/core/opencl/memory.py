@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
+from copy import copy
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,14 @@ from lnocl.core.opencl.layout import Layout
 from lnocl.core.scene.arrays import Array
 from lnocl.errors import DeviceError, InputError, note
 
+# Buffers of which each member of a batch has its own.
+OWN = {
+    *("images", "extended", "spectra", "star_fluxes", "star_corrections", "prior_fluxes"),
+    *("star_totals", "star_sums", "ratio_sums", "data_term", "square_sums", "slope", "curvature"),
+    *("smooth_sums", "objectives", "steps", "transmitted", "columns", "ratio_columns", "sampled"),
+    *("previous", "gradient", "change_sums", "star_steps", "step_sums", "coupling_sums"),
+    "scratch",
+}
 # Bytes of pixels that are converted and copied at once, lest a second array of all is needed.
 MAX_COPIED = 16 * 2**20
 # And bytes from which on a copy costs more than the call.
@@ -33,48 +42,68 @@ class Memory:
         Of arrays of pixels.
     scale : float
         Electrons per unit, for messages.
+    n_members : int, optional
+        Members of a batch.
 
     Attributes
     ----------
     buffers : dict of str to pyopencl.Buffer
         All of them.
+    n_members : int
+        As given.
+
+    Notes
+    -----
+    Each member has its own part of some buffers (`OWN`), one behind the other. This is the memory
+    of the first, `of` that of another: its verbs move that part, or what all members share.
     """
 
-    def __init__(self, queue: cl.CommandQueue, layout: Layout, scale: float) -> None:
+    def __init__(
+        self, queue: cl.CommandQueue, layout: Layout, scale: float, n_members: int = 1
+    ) -> None:
         self._queue, self._layout, self._scale = queue, layout, scale
+        self.n_members, self._member = n_members, 0
         self.buffers: dict[str, cl.Buffer] = {}
-        self._uploads: dict[str, cl.Event] = {}
+        self._uploads: dict[tuple[int, str], cl.Event] = {}
+
+    def of(self, member: int) -> Memory:
+        """Return the memory of another member of the batch."""
+        other = copy(self)
+        other._member = member
+        return other
 
     def allocate(self, **sizes: int) -> None:
-        """Make buffers of so many bytes, in the place of those with the same names."""
-        for name, size in sizes.items():
+        """Make buffers of so many bytes a member, in the place of those with the same names."""
+        for name, size in of_all(sizes, self.n_members).items():
             self.buffers.pop(name, None)  # first, lest the memory of both is taken
             self.buffers[name] = cl.Buffer(self._queue.context, READ_WRITE, size)
 
+    def _part(self, name: str) -> tuple[int, int]:
+        """Return where in a buffer the member's part begins, and the bytes it has."""
+        n, size = self.n_members if name in OWN else 1, int(self.buffers[name].size)
+        return self._member % n * (size // n), size // n
+
     def copy(self, one: str, other: str) -> None:
         """Copy a buffer, or its first numbers, to another, all of which is written."""
-        size = int(self.buffers[other].size)
-        cl.enqueue_copy(self._queue, self.buffers[other], self.buffers[one], byte_count=size)
+        given, to, copy = self.buffers[one], self.buffers[other], cl.enqueue_copy
+        (begin, _), (at, size) = self._part(one), self._part(other)
+        copy(self._queue, to, given, byte_count=size, src_offset=begin, dst_offset=at)
 
-    def clear(self, name: str) -> None:
-        """Set all of a buffer to 0."""
-        buffer = self.buffers[name]
-        cl.enqueue_fill_buffer(self._queue, buffer, np.zeros(1, self._layout.dtype), 0, buffer.size)
+    def clear(self, name: str, of_all: bool = False) -> None:
+        """Set all of a buffer to 0, that of all members too if wanted."""
+        zero, buffer = np.zeros(1, self._layout.dtype), self.buffers[name]
+        part = (0, buffer.size) if of_all else self._part(name)
+        cl.enqueue_fill_buffer(self._queue, buffer, zero, *part)
 
     def upload(self, name: str, values: NDArray) -> Array:
         """Copy numbers to a buffer, not waiting for the device; return them in its precision."""
         rounded = self._rounded(name, values)
         if rounded.size:
             # An event that is let go waits for its copy.
-            self._uploads[name] = cl.enqueue_copy(
-                self._queue, self.buffers[name], rounded, is_blocking=False
-            )
+            to, (at, _), copy = self.buffers[name], self._part(name), cl.enqueue_copy
+            copied = copy(self._queue, to, rounded, dst_offset=at, is_blocking=False)
+            self._uploads[self._member, name] = copied
         return rounded.astype(np.float64)
-
-    def upload_integers(self, name: str, values: NDArray) -> None:
-        """Copy whole numbers of 32 bits to a buffer."""
-        if len(values):
-            cl.enqueue_copy(self._queue, self.buffers[name], values.astype(np.int32))
 
     def upload_points(self, name: str, values: NDArray) -> None:
         """Copy values to a buffer, each as a point that holds for all pixels."""
@@ -82,7 +111,7 @@ class Memory:
 
     def upload_pixels(self, name: str, arrays: Iterable[NDArray]) -> None:
         """Copy arrays of pixels, or of some blocks' rows, to a buffer, one behind the other."""
-        offset = 0
+        offset, _ = self._part(name)
         for pixels in self._copied_at_once(arrays):
             packed = self._layout.pack_pixels(self._rounded(name, pixels))
             cl.enqueue_copy(self._queue, self.buffers[name], packed, dst_offset=offset)
@@ -108,23 +137,24 @@ class Memory:
         """Return the first numbers in a buffer, as float64."""
         values = np.empty(count, self._layout.dtype)
         if count:
-            cl.enqueue_copy(self._queue, values, self.buffers[name])
+            cl.enqueue_copy(self._queue, values, self.buffers[name], src_offset=self._part(name)[0])
         return values.astype(np.float64)
 
     def download_raw(self, name: str) -> NDArray:
         """Return all of a buffer as it lies on the device."""
         values = np.empty(self.count(name), self._layout.dtype)
-        cl.enqueue_copy(self._queue, values, self.buffers[name])
+        cl.enqueue_copy(self._queue, values, self.buffers[name], src_offset=self._part(name)[0])
         return values
 
     def upload_raw(self, name: str, values: NDArray) -> None:
         """Copy what `download_raw` returned, or the first of it, back."""
         if values.size:
-            cl.enqueue_copy(self._queue, self.buffers[name], values)
+            offset, _ = self._part(name)
+            cl.enqueue_copy(self._queue, self.buffers[name], values, dst_offset=offset)
 
     def count(self, name: str) -> int:
         """Return how many numbers a buffer holds."""
-        return int(self.buffers[name].size) // self._layout.dtype.itemsize
+        return self._part(name)[1] // self._layout.dtype.itemsize
 
     def _rounded(self, name: str, values: NDArray | float) -> NDArray:
         """Return values in the precision of the device; refuse values too large for it."""
@@ -137,6 +167,11 @@ class Memory:
                 f"cannot be held in {dtype}: scale the scene, or take `precision` double"
             )
         return rounded
+
+
+def of_all(sizes: Mapping[str, int], n_members: int) -> dict[str, int]:
+    """Return the bytes of buffers for all members of a batch, given those of one."""
+    return {name: size * (n_members if name in OWN else 1) for name, size in sizes.items()}
 
 
 def refuse_if_too_large(device: cl.Device, sizes: Mapping[str, int], count: int) -> int:

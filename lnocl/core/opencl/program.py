@@ -22,6 +22,7 @@ from lnocl.core.opencl.sources import LAST, arguments, beside, source
 from lnocl.core.opencl.tuning import Tuning, odd_part, tune
 from lnocl.core.scene.line_weights import TAPS
 from lnocl.core.scene.rotation import PHASE_ROWS
+from lnocl.core.scene.scene import MIN_MODEL
 from lnocl.errors import DeviceError
 from lnocl.process import LOCK, ignored_warnings
 
@@ -72,8 +73,6 @@ class Program:
         Pixels of the sky to one of the images, along each axis: 1, 2 or 4.
     has_turns : bool, optional
         Whether images are turned against the sky.
-    min_model : float, optional
-        The division guard.
 
     Attributes
     ----------
@@ -106,8 +105,6 @@ class Program:
         tuning: Tuning | None = None,
         oversample: int = 1,
         has_turns: bool = False,
-        *,
-        min_model: float = 0.0,
     ) -> None:
         device = context.devices[0]
         self.context, self.grid, self.dtype = context, grid, dtype
@@ -149,7 +146,7 @@ class Program:
             "TURN_TAPS": TAPS,
             "PHASE_ROWS": self.phase_rows,
             "COLUMN_PAIRS": self.column_pairs,
-            "MIN_MODEL": f"{min_model!r}",
+            "MIN_MODEL": MIN_MODEL,
         }
         definitions = [f"-D{name}={value}" for name, value in constants.items()]
         self.options = ["-cl-std=CL1.2", "-w", *definitions]

@@ -28,7 +28,7 @@ class Shears:
         Those of the latter.
     roll : ndarray of int, shape (Ny,)
         Columns by which the rows of the image are rotated, for its whole pixels.
-    line_firsts, line_weights : ndarray of int and of float64, shapes (n,) and (n, TAPS)
+    line_firsts, line_weights : ndarray of int32 and of float64, shapes (n,) and (n, TAPS)
         For `sample_lines`, where the image's pixels are larger than the sky's: of rows, of columns,
         and of their adjoints; else n is 0.
     """
@@ -41,7 +41,7 @@ class Shears:
         samplings = rotation.samplings
         firsts = [each.firsts for each in samplings] + [each.back_firsts for each in samplings]
         weights = [each.weights for each in samplings] + [each.back_weights for each in samplings]
-        self.line_firsts = np.concatenate([np.zeros(0, int), *firsts])
+        self.line_firsts = np.concatenate([np.zeros(0, np.int32), *firsts], dtype=np.int32)
         self.line_weights = np.concatenate([np.zeros((0, TAPS)), *weights])
 
     def pack_image_weights(self, block: int) -> Array:

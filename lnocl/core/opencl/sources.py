@@ -30,7 +30,6 @@ SOURCES = (
 # has all others. What a run has no use for is not compiled, and two may be compiled at once.
 FIRST = (
     "rfft_rows",
-    "irfft_rows",
     "otf_columns",
     "convolve_columns",
     "correlate_columns",

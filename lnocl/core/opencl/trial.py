@@ -48,9 +48,11 @@ trial.check = lambda device: None
 made = program.Program(context, (8, 8), numpy.dtype("f4"))
 made.kernel(sources.LAST[0])  # and all that are compiled with it
 launcher = launch.Launcher(made)
-buffers = {each: cl.Buffer(context, launch.READ_WRITE, 2**16) for each in ("pixels", "spectra")}
+flags, ones = launch.READ_WRITE | cl.mem_flags.COPY_HOST_PTR, numpy.ones(2**14, "f4")
+names = "pixels", "spectra", "steps"
+buffers = {name: cl.Buffer(context, flags, hostbuf=ones) for name in names}
 for name in ("rfft_rows", "fft_columns"):
-    launcher.bind(name, buffers)()
+    launcher.bind(name, buffers, n_images=1)()
 launcher.queue.finish()
 """
 # Enough for a linker.

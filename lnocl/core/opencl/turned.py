@@ -6,11 +6,10 @@ import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 
 import numpy as np
-import pyopencl as cl
 
 from lnocl.core.opencl.launch import Launch
 from lnocl.core.opencl.layout import Layout
-from lnocl.core.opencl.memory import Memory
+from lnocl.core.opencl.memory import OWN, Memory
 from lnocl.core.opencl.program import Program
 from lnocl.core.opencl.shears import Shears
 from lnocl.core.scene.arrays import Array
@@ -95,17 +94,17 @@ class TurnedImages:
         shears, block = self.shears, self._program.tuning.block
         phases = [self._layout.pack_phases(each) for each in self._rotations]
         memory.upload_raw("row_phases", np.array(phases))
-        memory.upload_integers("column_shifts", np.array([each.column_wholes for each in shears]))
+        memory.upload_raw("column_shifts", np.array([s.column_wholes for s in shears], np.int32))
         memory.upload("column_weights", np.array([each.column_weights for each in shears]))
         weights = [each.pack_image_weights(block) for each in shears]
         memory.upload("image_weights", np.array(weights))
         for name in ("ratio_columns", "ratio_sums"):
-            memory.clear(name)  # where no row of a block was observed it stays so
+            memory.clear(name, of_all=True)  # where no row of a block was observed it stays so
         if self._n_lines:
-            memory.upload_integers("firsts", np.concatenate([each.line_firsts for each in shears]))
+            memory.upload_raw("firsts", np.concatenate([each.line_firsts for each in shears]))
             memory.upload("weights", np.concatenate([each.line_weights for each in shears]))
             shifts, still = whole_and_weights(np.zeros(len(shears) * self._program.grid[1]))
-            memory.upload_integers("still_shifts", shifts + 1 - TAPS // 2)
+            memory.upload_raw("still_shifts", (shifts + 1 - TAPS // 2).astype(np.int32))
             memory.upload("still_weights", still)
 
     def laid(self, images: Iterable[Array]) -> Iterator[Array]:
@@ -113,9 +112,9 @@ class TurnedImages:
         for shears, image in zip(self.shears, images, strict=True):
             yield shears.lay(image)
 
-    def bind(self, bind: Callable[..., Launch], memory: Memory, queue: cl.CommandQueue) -> None:
+    def bind(self, bind: Callable[..., Launch], memory: Memory) -> None:
         """Bind the kernels; `bind` does so by a kernel's name to what all images share."""
-        self._buffers, self._queue = memory.buffers, queue
+        self._memory = memory
         self._kernels = {
             name: bind(name, count=max(count for _, count in self._runs))
             for name in ("irfft_sheared", "ratio_sheared", "rfft_sheared")
@@ -125,8 +124,10 @@ class TurnedImages:
             spectra, columns = self._layout.spectra_shape, self._layout.columns_shape
             ny, nx = self._program.grid
             self._rows, self._columns = self._lines(spectra, ny), self._lines(columns, nx)
+            places = dict.fromkeys(("given_size", "table", "array", "to"), 0)
+            given = memory.buffers["spectra"]
             self._kernels["sample_lines"] = bind(
-                "sample_lines", given=self._buffers["spectra"], table=0, array=0, **self._columns
+                "sample_lines", given=given, **places, **self._columns
             )
 
     def _lines(self, shape: tuple[int, ...], n: int) -> dict[str, int]:
@@ -148,6 +149,7 @@ class TurnedImages:
             self._launch("ratio_sheared", columns="columns", **images)
             self._launch(
                 "rfft_sheared",
+                spectra="spectra",
                 ratio_columns="ratio_columns",
                 column_shifts="column_shifts",
                 column_weights="column_weights",
@@ -158,7 +160,7 @@ class TurnedImages:
         """Make the ratio of an image of larger pixels, whose tables begin at a line."""
         (ny, nx), rows, columns = self._program.grid, self._rows, self._columns
         back = table + ny + nx
-        self._sample("spectra", table, rows, image)
+        self._sample("spectra", table, rows, array=image)
         self._launch("irfft_sheared", spectra="sampled", image=0, count=1)
         self._sample("columns", table + ny, columns)
         self._launch("ratio_sheared", columns="sampled", image=image, count=1)
@@ -166,25 +168,24 @@ class TurnedImages:
         self._sample("columns", back + ny, columns)
         self._launch(
             "rfft_sheared",
+            spectra="columns",
             ratio_columns="sampled",
             column_shifts="still_shifts",
             column_weights="still_weights",
-            image=image,
+            image=0,
             count=1,
         )
-        self._sample("spectra", back, rows, image)
-        size, (spectra, sampled) = (
-            self._layout.spectra_bytes,
-            (self._buffers[each] for each in ("spectra", "sampled")),
-        )
-        cl.enqueue_copy(self._queue, spectra, sampled, byte_count=size, dst_offset=image * size)
+        self._sample("columns", back, rows, sampled="spectra", to=image)
 
-    def _sample(self, name: str, table: int, lines: dict[str, int], image: int = 0) -> None:
-        """Take lines of a buffer, or of one of its arrays, by the table that begins at a line."""
-        self._launch("sample_lines", given=name, array=image, table=table, **lines)
+    def _sample(self, given: str, table: int, lines: dict[str, int], **other: str | int) -> None:
+        """Take lines of an array in a buffer into another, by the table that begins at a line."""
+        places = {"array": 0, "sampled": "sampled", "to": 0, **other}
+        self._launch("sample_lines", given=given, table=table, **places, **lines)
 
     def _launch(self, name: str, **arguments: str | int) -> None:
         """Launch a kernel with other arguments, buffers by their names."""
-        buffers, kernel = self._buffers, self._kernels[name]
-        kernel.set(**{k: buffers[v] if isinstance(v, str) else v for k, v in arguments.items()})
+        memory, kernel = self._memory, self._kernels[name]
+        buffers = {k: v for k, v in arguments.items() if isinstance(v, str)}
+        sizes = {f"{k}_size": memory.count(v) for k, v in buffers.items() if v in OWN}
+        kernel.set(**arguments | {k: memory.buffers[v] for k, v in buffers.items()} | sizes)
         kernel()

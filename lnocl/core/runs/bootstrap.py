@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field, replace
 from functools import partial
+from itertools import chain
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -13,7 +15,7 @@ import numpy as np
 from lnocl.core.runs.outcome import Outcome
 from lnocl.core.runs.progress import Progress
 from lnocl.core.runs.quantities import Part, Quantity, in_electrons, measure, quantities_of
-from lnocl.core.runs.replicas import Replicas
+from lnocl.core.runs.replicas import Replica, Replicas
 from lnocl.core.scene.apertures import AMOUNT, FLUX, FWHM
 from lnocl.core.scene.arrays import Array, whole
 from lnocl.core.scene.texture import resolution
@@ -26,6 +28,8 @@ if TYPE_CHECKING:
 MIN_REPLICAS = 10
 # Levels of the intervals.
 LEVELS = 0.68, 0.95
+# Replicas that are reconstructed together, at most, and pixels of their images.
+MOST_TOGETHER, BATCH_PIXELS = 16, 2**19
 
 
 @dataclass(frozen=True, eq=False)
@@ -282,13 +286,15 @@ def bootstrap(
     if earlier is not None:
         _refuse_other(earlier, found)
         found = earlier
-    make = partial(_Measuring, outcome, parts, seed, found.resolution)
+    size = 1 if parallel else _together(outcome)
+    batches = [range(k, min(k + size, n)) for k in range(found.n, n, size)]
+    make = partial(_Measuring, outcome, parts, seed, found.resolution, size)
     with (
         Progress(n, "replica", progress, "replicas") as bar,
-        closing(work(make, range(found.n, n), parallel)) as measured,
+        closing(work(make, batches, parallel)) as measured,
     ):
         bar.update(found.n)
-        for each in measured:
+        for each in chain.from_iterable(measured):
             found = _with(found, each)
             bar.update()
             if look is not None and found.n > 1:
@@ -319,6 +325,13 @@ def check_number(n: object, seed: object) -> None:
     whole("seed", seed, 0)
 
 
+def _together(outcome: Outcome) -> int:
+    """Return how many replicas are reconstructed together: more of them would gain nothing."""
+    pixels = outcome.scene.n_images * math.prod(outcome.scene.grid)
+    is_batch = not outcome.setup.refine_positions  # else each has an engine of its own
+    return min(max(BATCH_PIXELS // pixels, 1), MOST_TOGETHER) if is_batch else 1
+
+
 class _Measured(NamedTuple):
     """What a replica adds to the arrays of `Bootstrap` of these names."""
 
@@ -328,11 +341,13 @@ class _Measured(NamedTuple):
 
 
 class _Measuring:
-    """Makes a replica by its number, and measures it."""
+    """Makes replicas by their numbers, and measures them."""
 
-    def __init__(self, outcome: Outcome, parts: Sequence[Part], seed: int, width: float) -> None:
+    def __init__(
+        self, outcome: Outcome, parts: Sequence[Part], seed: int, width: float, size: int
+    ) -> None:
         self._outcome, self._parts, self._width = outcome, parts, width
-        self._replicas = Replicas(outcome, seed)
+        self._replicas = Replicas(outcome, seed, size)
         self._smooth_answer = self._smooth(outcome.estimate.observed_sky)
 
     def _smooth(self, sky: Array) -> Array:
@@ -341,8 +356,10 @@ class _Measuring:
 
         return np.asarray(gaussian_filter(sky, self._width / FWHM, mode="nearest"))
 
-    def __call__(self, k: int) -> _Measured:
-        replica = self._replicas.reconstruct(k)
+    def __call__(self, numbers: Sequence[int]) -> list[_Measured]:
+        return list(map(self._measure, self._replicas.reconstruct(*numbers)))
+
+    def _measure(self, replica: Replica) -> _Measured:
         drawn, seen = (measure(self._outcome, sky, self._parts) for sky in replica[:2])
         last, of_psfs = replica.found, np.zeros((0, len(seen)))
         if replica.found_with_psfs is not None:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lnocl.core.engines.engine import State
-from lnocl.core.runs.run import Run
+from lnocl.core.runs.run import make_runs
 from lnocl.core.runs.start import Start
 from lnocl.core.scene.arrays import Array
 from lnocl.errors import DivergedError, NotFiniteError, warn
@@ -69,7 +69,7 @@ class Halves:
 
     def __init__(self, starts: Sequence[Start], n_iter: int, stride: int, first: int = 0) -> None:
         self._n_iter, self._stride = n_iter, stride
-        self._runs = [Run(start, n_iter - first, half) for half, start in enumerate(starts)]
+        self._runs = make_runs(starts, n_iter - first)
         self._going = [iter(run) for run in self._runs]
         self.first = self.done = first
         self.snapshots: list[Snapshot] = []
@@ -106,8 +106,10 @@ class Halves:
 
     def _advance(self, goal: int) -> bool:
         """Run both to an iteration beyond those done; return whether they get there."""
-        for run, going in zip(self._runs, self._going, strict=True):
+        for run in self._runs:
             run.goal = goal - self.first
+            run.set_off()
+        for run, going in zip(self._runs, self._going, strict=True):
             while run.done < run.goal:
                 if next(going, None) is None:
                     return False

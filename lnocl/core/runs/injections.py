@@ -45,7 +45,7 @@ class Injections:
             Of the counts of the sources.
         """
         images = self._outcome.observation.images + self._counts(places, fluxes, rng)
-        return self._repeated.of(images)
+        return self._repeated.of((images, None))[0]
 
     def _counts(self, places: Array, fluxes: Array, rng: np.random.Generator) -> Array:
         """Return counts of sources in each image, 0 in bad pixels."""

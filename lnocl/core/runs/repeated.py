@@ -8,7 +8,7 @@ import numpy as np
 
 from lnocl.core.runs.halos import settle_halos
 from lnocl.core.runs.outcome import Outcome, marginalise
-from lnocl.core.runs.run import Run
+from lnocl.core.runs.run import complete_together, make_runs
 from lnocl.core.runs.start import make_start
 from lnocl.core.scene.arrays import Array
 from lnocl.core.scene.star_prior import StarPrior
@@ -25,29 +25,34 @@ class Repeated:
     ----------
     outcome : Outcome
         The reconstruction.
+    n : int, optional
+        As many are made together, at most.
     """
 
-    def __init__(self, outcome: Outcome) -> None:
+    def __init__(self, outcome: Outcome, n: int = 1) -> None:
         self._outcome = outcome
         with ignored_warnings():  # those of the reconstruction are the same
             self._start = settle_halos(make_start(outcome.setup, outcome.scene.penalty))
-        self._run = Run(self._start, max(len(outcome.objectives) - 1, 1))
+        self._runs = make_runs([self._start] * n, max(len(outcome.objectives) - 1, 1))
 
-    def of(self, counts: Array, prior: StarPrior | None = None) -> Outcome:
-        """Return the reconstruction of images with these counts, shape (p, ny, nx).
+    def of(self, *given: tuple[Array, StarPrior | None]) -> list[Outcome]:
+        """Return the reconstructions of images with these counts, shape (p, ny, nx), and priors.
 
-        `prior` takes the place of that of the reconstruction, where there is one.
+        A prior takes the place of that of the reconstruction, where there is one. The next call
+        changes the scenes of these reconstructions.
 
         Raises
         ------
         NotFiniteError, DivergedError
-            Its objective is not finite, or rises.
+            An objective is not finite, or rises.
         """
-        run, outcome = self._run, self._outcome
-        if prior is not None:
-            run.scene.star_prior = prior.scaled(run.scene.unit, run.scene.scale)
-        run.repeat(self._start, outcome.scene.observation.replace(images=counts))
+        runs, outcome = self._runs[: len(given)], self._outcome
+        for run, (counts, prior) in zip(runs, given, strict=True):
+            if prior is not None:
+                run.scene.star_prior = prior.scaled(run.scene.unit, run.scene.scale)
+            run.repeat(self._start, outcome.scene.observation.replace(images=counts))
         with np.errstate(over="ignore", invalid="ignore"):
-            run.complete()
+            complete_together(runs)
         wanted = outcome.is_marginal, outcome.has_marginal_halos, outcome.has_levels
-        return dataclasses.replace(outcome, estimate=marginalise(run.estimate(), *wanted))
+        estimates = (marginalise(run.estimate(), *wanted) for run in runs)
+        return [dataclasses.replace(outcome, estimate=estimate) for estimate in estimates]

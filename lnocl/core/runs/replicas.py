@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple, cast
 
@@ -17,6 +17,9 @@ from lnocl.core.scene.psf_field import Psfs, mapped
 from lnocl.core.scene.psf_pixels import PsfPixels
 from lnocl.core.scene.star_prior import StarPrior
 from lnocl.core.scene.texture import Texture, hidden_radii, resolution
+
+# Counts, shape (p, ny, nx), and a prior of the stars.
+Given = tuple[Array, StarPrior | None]
 
 
 class Sky(NamedTuple):
@@ -66,9 +69,11 @@ class Replicas:
         The answer.
     seed : int
         Replica k depends on this and k alone.
+    n : int, optional
+        As many are reconstructed together, at most.
     """
 
-    def __init__(self, outcome: Outcome, seed: int) -> None:
+    def __init__(self, outcome: Outcome, seed: int, n: int = 1) -> None:
         self._outcome, self._seed, scene = outcome, seed, outcome.scene
         width = resolution(scene)
         self._texture = Texture(
@@ -82,16 +87,23 @@ class Replicas:
             self._pixels = PsfPixels(
                 observation.psfs, observation.psf_scatter, observation.oversample
             )
-        self._repeated = Repeated(outcome)
+        self._repeated = Repeated(outcome, n)
 
-    def reconstruct(self, k: int) -> Replica:
-        """Return replica k.
+    def reconstruct(self, *numbers: int) -> list[Replica]:
+        """Return replicas of these numbers.
 
         Raises
         ------
         NotFiniteError, DivergedError
-            Its objective is not finite, or rises.
+            An objective is not finite, or rises.
         """
+        drawn, counts, others = zip(*map(self._observe, numbers), strict=True)
+        found = self._find(counts)
+        of_psfs = self._find(others) if self._pixels else [None] * len(found)
+        return list(map(Replica, drawn, found, of_psfs))
+
+    def _observe(self, k: int) -> tuple[Sky, Given, Given | None]:
+        """Return the sky of a replica, counts and prior, and those where the PSFs are wrong too."""
         scene = self._outcome.scene
         of_sky, of_psfs, *of_images, of_prior = np.random.SeedSequence([self._seed, k]).spawn(
             scene.n_images + 3
@@ -103,19 +115,20 @@ class Replicas:
         counts = self._draw(models, of_images)
         prior, star_fluxes = scene.penalty.stars, self._outcome.star_fluxes
         prior = prior and prior.drawn(star_fluxes, np.random.default_rng(of_prior))
-        found = self._find(counts, prior)
         if self._pixels is None:
-            return Replica(drawn, found, None)
+            return drawn, (counts, prior), None
         others = self._means(Model(scene.seen_through(self._draw_psfs(of_psfs))), sky)
         # The same noise: counts that are drawn of almost the same mean may be quite others.
         changed = [n + b - a for n, a, b in zip(counts, models, others, strict=True)]
-        return Replica(drawn, found, self._find(np.maximum(changed, 0.0), prior))
+        return drawn, (counts, prior), (np.maximum(changed, 0.0), prior)
 
-    def _find(self, counts: Array, prior: StarPrior | None) -> Sky:
-        """Return the reconstruction of an observation with these counts and this prior."""
-        found = self._repeated.of(counts, prior)
-        places = found.scene.stars.copy()  # the scene moves its stars for the next
-        return Sky(found.estimate.observed_sky, found.light().sky(), found.star_fluxes, places)
+    def _find(self, given: Iterable[Given]) -> list[Sky]:
+        """Return the reconstructions of observations with these counts and priors."""
+        return [
+            # The scene moves its stars for the next.
+            Sky(x.estimate.observed_sky, x.light().sky(), x.star_fluxes, x.scene.stars.copy())
+            for x in self._repeated.of(*given)
+        ]
 
     def _draw_psfs(self, seed: np.random.SeedSequence) -> Psfs:
         psfs = self._outcome.scene.observation.psfs

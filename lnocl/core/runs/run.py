@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from copy import copy
 from functools import cached_property
+from itertools import starmap
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -43,11 +44,11 @@ class Run:
         Where it starts.
     n_iter : int
         Iterations at most.
-    half : {0, 1}, optional
-        Which half of the counts it is of, where both are run side by side.
     tolerance : float, optional
         It ends where the objective changes by less than this share of itself an iteration, in the
         mean of ten; 0 for never.
+    engine : Engine, optional
+        One of a scene like that of the start; by default a new one.
 
     Attributes
     ----------
@@ -73,14 +74,19 @@ class Run:
     """
 
     def __init__(
-        self, start: Start, n_iter: int, half: int | None = None, tolerance: float = 0.0
+        self,
+        start: Start,
+        n_iter: int,
+        tolerance: float = 0.0,
+        engine: Engine | None = None,
     ) -> None:
-        self._setup, self.n_iter, self._half = start.setup, n_iter, half
-        self.scene, self.tolerance = copy(start.scene), tolerance
+        self._setup, self.n_iter, self.tolerance = start.setup, n_iter, tolerance
+        of_scene = start.setup, start.scaling, [copy(start.scene)], n_iter
+        self.engine = engine or _make_engines(*of_scene)[0]
+        self.scene = self.engine.scene
         ahead = AHEAD_PIXELS // (self.scene.n_images * math.prod(self.scene.grid))
         self.stride, self.goal = min(max(ahead, 1), MOST_AHEAD[tolerance > 0]), n_iter
         self._refines = start.refines
-        self.engine = _make_engine(self._setup, self.scene, n_iter, start.scaling, half)
         self._begin(start)
 
     def _begin(self, start: Start) -> None:
@@ -120,7 +126,7 @@ class Run:
         while self.done < self.n_iter:
             begin, is_stage_new = self.done, self.engine.look().is_first
             while (looked := self.done) < (due := min(self._due, self.n_iter)):
-                if not self._advance(due):
+                if not self._advance():
                     break
                 self._check(descent, looked + 1)
                 yield self.done
@@ -134,23 +140,26 @@ class Run:
     def _check(self, descent: Descent, first: int) -> None:
         """Refuse objectives that rise, where steps are not refused for that."""
         if self.engine.scaling is None:
-            descent.check(self.engine.objectives(first).tolist())
+            descent.check(self.engine.objectives(first)[: self.done + 1 - first].tolist())
 
-    def _advance(self, due: int) -> bool:
+    def _advance(self) -> bool:
         """Do iterations until the next look is due; return whether any was done."""
-        before, engine = self.done, self.engine
-        if engine.look().reason == PAUSED:
-            goal = min(before + self.stride, due, self.goal)
-            engine.go_on(goal + 1, self.tolerance)
-            for _ in range(goal - before):
-                engine.tick()
-            while engine.look().going:  # as steps were refused
-                engine.tick()
-        steps = engine.look()
+        before = self.done
+        self.set_off()
+        self.engine.finish()
+        steps = self.engine.look()
         if steps.reason == NOT_FINITE:
             refuse_not_finite(math.nan)
         self.done = steps.done
         return self.done > before
+
+    def set_off(self) -> None:
+        """Let the engine's next ticks iterate until the next look is due."""
+        steps, goal = self.engine.look(), min(self._due, self.n_iter, self.goal)
+        # Where it is beyond those done it has set off, and its batch's ticks have brought it there.
+        rests = steps.reason == PAUSED and not steps.going and steps.done == self.done
+        if rests and self.done < goal:
+            self.engine.go_on(min(self.done + self.stride, goal) + 1, self.tolerance)
 
     def complete(self, tick: Callable[[int], object] = int) -> str:
         """Run to the end, telling how many iterations are done more; return why it ended."""
@@ -186,7 +195,7 @@ class Run:
             "progress": np.array([self.done, self._due]),
             "positions": self.scene.stars,
         }
-        if scaling is not None:
+        if self._refines and scaling is not None:  # else it is that of the start
             state |= scaling.state()
         for values in state.values():
             refuse_not_finite(values.sum(initial=0.0, dtype=np.float64))
@@ -210,10 +219,8 @@ class Run:
         if self._refines:
             self.scene.move_stars(state["positions"])
             self.engine.move_stars()
-        if self.engine.scaling is not None:
-            from lnocl.core.solvers.scaling import Scaling
-
-            self.engine.set_scaling(Scaling.from_state(state))
+        if self._refines and (scaling := self.engine.scaling) is not None:
+            self.engine.set_scaling(scaling.restored(state))
         self.engine.restore(state)
 
     def return_to_best(self, state: State) -> None:
@@ -229,7 +236,7 @@ class Run:
         best = self.best_iteration()
         scaling = self.engine.scaling
         del self.engine  # the device need not hold both
-        self.engine = _make_engine(self._setup, self.scene, self.n_iter, scaling, self._half)
+        (self.engine,) = _make_engines(self._setup, scaling, [self.scene], self.n_iter)
         self.restore(state)
         n_iter, self.n_iter = self.n_iter, best
         self.complete()
@@ -312,14 +319,39 @@ class Run:
         )
 
 
-def _make_engine(
-    setup: Setup, scene: Scene, n_iter: int, scaling: Scaling | None, half: int | None
-) -> Engine:
+def make_runs(starts: Sequence[Start], n_iter: int) -> list[Run]:
+    """Return runs from starts that differ in their images alone, as a batch: they share ticks.
+
+    Where stars move each run has an engine of its own.
+    """
+    setup, scaling, scenes = starts[0].setup, starts[0].scaling, [copy(s.scene) for s in starts]
+    pairs = zip(starts, _make_engines(setup, scaling, scenes, n_iter), strict=True)
+    return [Run(start, n_iter, engine=engine) for start, engine in pairs]
+
+
+def complete_together(runs: Sequence[Run]) -> None:
+    """Run all to the end; what they raise is raised here."""
+    going = [(run, iter(run)) for run in runs]
+    while going:
+        for run, _ in going:
+            run.set_off()
+        going = [(run, each) for run, each in going if next(each, None) is not None]
+
+
+def _make_engines(
+    setup: Setup, scaling: Scaling | None, scenes: Sequence[Scene], n_iter: int
+) -> list[Engine]:
     # Imported where it is chosen: the reference runs where no OpenCL is installed.
     if setup.engine == "numpy":
         from lnocl.core.engines.numpy import ReferenceEngine
 
-        return ReferenceEngine(scene, scaling)
+        return [ReferenceEngine(scene, scaling) for scene in scenes]
     from lnocl.core.engines.opencl import OpenCLEngine
 
-    return OpenCLEngine(scene, setup.precision, setup.device, n_iter, scaling=scaling, half=half)
+    device, n, made = (setup.precision, setup.device), len(scenes), list[Engine]()
+    size = 1 if setup.refine_positions and scenes[0].n_stars else n  # members that share ticks
+    for k in range(0, n, size):
+        counts = size, 0 if k else n
+        first = OpenCLEngine(scenes[k], *device, n_iter, None, scaling, *counts)
+        made += [first, *starmap(first.member, enumerate(scenes[k + 1 : k + size], 1))]
+    return made

@@ -47,21 +47,24 @@ class Scaling:
         The values of `cross_information`, one cutout after the other.
     cross_windows : ndarray of int32, shape (n, 4)
         For each cutout y, x, height and width.
+    total_weight : ndarray of float64, shape (Ny, Nx), or None
+        alpha, where that is not the number of images.
     """
 
     shift: Array
     star_information: BandMatrix
     cross_values: Array
     cross_windows: NDArray[np.int32]
+    total_weight: Array | None
 
-    @classmethod
-    def from_state(cls, state: Mapping[str, NDArray]) -> Scaling:
-        """Return the scaling of a state."""
+    def restored(self, state: Mapping[str, NDArray]) -> Scaling:
+        """Return the scaling of a state of the same observation."""
         information = BandMatrix(state["star_information"].T, state["star_order"])
-        return cls(state["shift"], information, state["cross_values"], state["cross_windows"])
+        shift, values, windows = (state[e] for e in ("shift", "cross_values", "cross_windows"))
+        return Scaling(shift, information, values, windows, self.total_weight)
 
     def state(self) -> dict[str, NDArray]:
-        """Return the arrays from which `from_state` makes the scaling."""
+        """Return the arrays from which `restored` makes the scaling."""
         return {
             "shift": self.shift,
             "star_information": self.star_information.band.T,
@@ -89,11 +92,11 @@ class Scaling:
         m = len(before.places)
         band = np.zeros((len(before.band), m + n), order="F")
         band[:, :m], band[0, m:] = before.band, HELD
-        return Scaling(
-            self.shift,
-            BandMatrix(band, np.append(before.places, np.arange(m, m + n))),
-            np.append(self.cross_values, np.zeros(n)),
-            np.append(self.cross_windows, np.tile(NOTHING, (n, 1)), axis=0),
+        return replace(
+            self,
+            star_information=BandMatrix(band, np.append(before.places, np.arange(m, m + n))),
+            cross_values=np.append(self.cross_values, np.zeros(n)),
+            cross_windows=np.append(self.cross_windows, np.tile(NOTHING, (n, 1)), axis=0),
         )
 
     def with_prior(self, prior: StarPrior) -> Scaling:
@@ -130,6 +133,7 @@ def prepare(
         stars, scaling = prepare(known.scene, known, extended, stars)
         return np.append(stars, halos), scaling.holding(len(halos))
     total_weight, inverse = _back_projections(model)
+    kept = None if scene.weights is None else total_weight
     information = BandMatrix(np.zeros((1, 0)), np.zeros(0, int))
     values, windows = np.zeros(0), np.zeros((0, 4), np.int32)
     if scene.n_fluxes:
@@ -145,7 +149,16 @@ def prepare(
     shift = np.divide(total_weight, inverse, out=np.zeros_like(inverse), where=inverse > 0)
     np.maximum(shift, 0.0, out=shift)
     shift *= SHIFT
-    return star_fluxes, Scaling(shift, information, values, windows)
+    return star_fluxes, Scaling(shift, information, values, windows, kept)
+
+
+def inverse_weight(scene: Scene, scaling: Scaling | None) -> Array:
+    """Return ``1 / sum_j A_j^T w_j`` of a scene with weights, 0 where nothing was observed."""
+    total = scaling.total_weight if scaling is not None else None
+    if total is None:
+        model = Model(scene)
+        total = model.adjoint(model.weights)
+    return np.divide(1.0, total, out=np.zeros_like(total), where=scene.observed(total))
 
 
 def heed(prior: StarPrior | None, star_fluxes: Array, scaling: Scaling) -> tuple[Array, Scaling]:
