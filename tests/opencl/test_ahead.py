@@ -45,12 +45,13 @@ def first_run(folder, before=""):
     ("before", "expected", "ended"),
     [
         ("", "True True", "[0]"),
+        ("from lnocl.core.opencl import trial; trial._try = None", "True True", "[0]"),
         ("ahead.SCRIPT = 'raise SystemExit(3)'", "True False", "[3]"),
         ("process.is_worker = True", "True False", "[]"),
         ("process.n_cores = lambda: 1", "True False", "[]"),
         (NO_PROCESS, "True False", "[]"),
     ],
-    ids=["done", "failed", "worker", "one core", "no process"],
+    ids=["done", "instead of a trial", "failed", "worker", "one core", "no process"],
 )
 def test_another_process_compiles_what_is_needed_last(tmp_path, before, expected, ended):
     cold = first_run(tmp_path, before)

@@ -12,6 +12,7 @@ import subprocess
 import sys
 from contextlib import suppress
 from pathlib import Path
+from subprocess import PIPE
 from typing import TYPE_CHECKING
 
 from lnocl import process
@@ -33,8 +34,11 @@ import pyopencl as cl
 from lnocl.core.opencl import ahead, device, launch, program, sources, trial, tuning
 ahead.begin = trial.check = lambda *_: None
 context = device.context_of(device.choose(sys.argv[2]).device)
+if sys.argv[4]:
+    exec(trial.KERNEL)
+    print("lives", flush=True)
 made = program.Program(context, *eval(sys.argv[3]))
-made.options, launcher = sys.argv[4:], launch.Launcher(made)
+made.options, launcher = sys.argv[5:], launch.Launcher(made)
 nothing = cl.Buffer(context, cl.mem_flags.COPY_HOST_PTR, hostbuf=bytes(2**20))
 for name in sources.LAST:
     types = made.arguments[name].items()
@@ -51,16 +55,20 @@ def begin(file: Path, program: Program) -> None:
     is_new = not (process.is_worker or file in _begun or program.is_stored)
     if not is_new or device.platform.name != POCL or process.n_cores() < 2:
         return
-    trial.check(device)  # for what it would die of too
     if not kernel_cache.can_write(file.parent):
         return
+    if is_known := trial.outcome(device) is not None:
+        trial.check(device)  # which names the linker
     given = f"{program.grid}, numpy.dtype({program.dtype.str!r}), tuning.{program.tuning}"
     given += f", {program.oversample}, {program.has_turns}"
     root = str(Path(__file__).parents[3])
-    script = [sys.executable, "-P", "-c", SCRIPT, root, spec_of(device), given, *program.options]
+    words = [root, spec_of(device), given, "" if is_known else "tries", *program.options]
+    script, out = [sys.executable, "-P", "-c", SCRIPT, *words], nowhere if is_known else PIPE
     with suppress(OSError):
-        _begun[file] = subprocess.Popen(script, stdin=nowhere, stdout=nowhere, stderr=nowhere)
+        _begun[file] = subprocess.Popen(script, stdin=nowhere, stdout=out, stderr=nowhere)
         atexit.register(_begun[file].send_signal, signal.SIGINT)
+        if not is_known:
+            trial.at_work.append(_begun[file])
 
 
 def wait(file: Path) -> None:

@@ -274,19 +274,23 @@ def _file(context: cl.Context, text: str, options: Iterable[str]) -> Path:
 @lru_cache(MAX_PROGRAMS)
 def _build(context: cl.Context, text: str, options: tuple[str, ...]) -> _Built:
     """Return a program that the process has, that a file holds, or that is compiled now."""
-    _need_room(context.devices[0])
-    unknown_cpu.name_level(context.devices[0])
-    trial.check(context.devices[0])
+    device = context.devices[0]
+    _need_room(device)
+    unknown_cpu.name_level(device)
+    if device.platform.name != unknown_cpu.POCL:
+        trial.check(device)
     file = _file(context, text, options)
     ahead.wait(file)
-    return _Built(context, text, options, file)
+    built = _Built(context, text, options, file)
+    trial.check(device)  # PoCL may end the process as it links kernels, no sooner
+    return built
 
 
 after_fault(_build.cache_clear)  # the context may be lost
 
 
 def _need_room(device: cl.Device) -> None:
-    """Refuse to compile with PoCL where addresses are too few.
+    """Refuse to compile with PoCL where addresses are too few, or files that may be open.
 
     Raises
     ------
@@ -295,6 +299,7 @@ def _need_room(device: cl.Device) -> None:
     """
     if device.platform.name != unknown_cpu.POCL or not hasattr(mmap, "MAP_PRIVATE"):
         return
+    trial.need_files()
     try:
         mmap.mmap(-1, ROOM, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS).close()
     except OSError as error:

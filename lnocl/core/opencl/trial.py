@@ -17,6 +17,8 @@ import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
 from glob import glob
+from pathlib import Path
+from typing import IO, cast
 
 import pyopencl as cl
 
@@ -26,6 +28,8 @@ from lnocl.core.opencl.sources import source
 from lnocl.core.opencl.unknown_cpu import POCL
 from lnocl.errors import DeviceError
 
+# Processes that compile kernels anyway, and print a line behind the first.
+at_work: list[subprocess.Popen[bytes]] = []
 # What the outcome may depend on, besides the device.
 VARIABLES = ("PATH", "COMPILER_PATH", "LIBRARY_PATH", "TMPDIR", "TEMP", "TMP")
 LIMITS = ("RLIMIT_NOFILE", "RLIMIT_NPROC", "RLIMIT_AS", "RLIMIT_FSIZE")
@@ -104,17 +108,24 @@ def check(device: cl.Device) -> None:
     DeviceError
         It does; the message says what to install, to set or to take.
     """
-    is_pocl = device.platform.name == POCL
+    is_pocl, note, found = device.platform.name == POCL, _note(device), outcome(device)
     if is_pocl:
-        _need_files()
-    note = kernel_cache.file_of(_environment(device)).with_suffix(".trial")
-    outcome = kernel_cache.read(note)
-    if outcome is None:
-        outcome = _find_linker(device) if is_pocl else _compile(device)
-        if outcome and kernel_cache.can_write(note.parent):
-            kernel_cache.write(note, outcome)
-    elif outcome == b"ziglang":
+        need_files()
+    if found is None:
+        found = _find_linker(device) if is_pocl else _compile(device)
+        if found and kernel_cache.can_write(note.parent):
+            kernel_cache.write(note, found)
+    elif found == b"ziglang":
         _take_ziglang()
+
+
+def outcome(device: cl.Device) -> bytes | None:
+    """Return what was found in a trial of a device before; None where there was none."""
+    return kernel_cache.read(_note(device))
+
+
+def _note(device: cl.Device) -> Path:
+    return kernel_cache.file_of(_environment(device)).with_suffix(".trial")
 
 
 def _compile(device: cl.Device) -> bytes:
@@ -126,7 +137,7 @@ def _compile(device: cl.Device) -> bytes:
     return b"lives"
 
 
-def _need_files() -> None:
+def need_files() -> None:
     """Refuse to go where PoCL and its linker cannot open their files."""
     opened: list[int] = []
     try:
@@ -160,7 +171,7 @@ def _foreign(folders: str) -> str:
 
 def _find_linker(device: cl.Device) -> bytes:
     """Return the linker that works: b"system" or b"ziglang"; b"" where that cannot be tried."""
-    failure = _try(device, KERNEL)
+    failure = "" if at_work and _lives(at_work.pop()) else _try(device, KERNEL)
     if not failure:
         return b"" if failure is None else b"system"
     if importlib.util.find_spec("ziglang"):
@@ -169,6 +180,12 @@ def _find_linker(device: cl.Device) -> bytes:
             return b"ziglang"
     cause = next((CAUSES[words] for words in CAUSES if words in failure), failure)
     raise DeviceError(f"PoCL cannot link kernels: {cause}")
+
+
+def _lives(process: subprocess.Popen[bytes]) -> bool:
+    """Return whether a process that is at work has compiled its first kernel."""
+    with cast(IO[bytes], process.stdout) as out:
+        return out.readline() == b"lives\n"
 
 
 def _try(device: cl.Device, kernels: str) -> str | None:
