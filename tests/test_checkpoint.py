@@ -117,6 +117,27 @@ def test_a_run_cut_off_where_no_step_was_left_for_the_stars_as_they_were_goes_on
         os.remove(path)
 
 
+@pytest.mark.parametrize("engine", ENGINES[:2])
+def test_a_run_that_has_converged_is_resumed_as_it_is(engine, tmp_path):
+    """No step was left: the device has taken its stars back to where they were before."""
+    y, x = np.indices((16, 16))
+    paths = [str(tmp_path / name) for name in ("a.fits", "b.fits")]
+    stars, fluxes = [(5.2, 6.1), (10.2, 9.1)], (3000.0, 1000.0)
+
+    def blurred(x, y):
+        return np.exp(-(x**2 + y**2 + 0.3 * x * y) / 3.0)
+
+    image = 30.0 + sum(f * blurred(x - a, y - b) for (a, b), f in zip(stars, fluxes, strict=True))
+    psf = blurred(x[:7, :7] - 3, y[:7, :7] - 3)
+    observation = lnocl.Observation(np.random.default_rng(2).poisson(image), psf, background=30.0)
+    given = {"observation": observation, "stars": stars, "n_iter": 3000, "mu": 1e-2}
+    given |= {"solver": "sgp", "pad": 4, **engine}
+    whole = paper(**given, checkpoint=paths[0])
+    assert whole.stop_reason == "converged"
+    assert_same(paper(**given, resume=paths[0], checkpoint=paths[1]), whole)
+    assert_same(paper(**given, resume=paths[1]), whole)
+
+
 def test_a_callback_that_ends_a_run_where_it_ends_anyway_is_not_heeded(tmp_path):
     made, path = STARS.make(), str(tmp_path / "run.fits")
     given = {"n_iter": 400, "stop": 1e-3, "engine": "numpy"}

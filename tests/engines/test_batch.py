@@ -6,9 +6,14 @@ import numpy as np
 import pytest
 from kinds import STARS, observe
 
-from lnocl.core.runs.run import Run, make_runs
+from lnocl.core.engines import opencl
+from lnocl.core.engines.opencl import OpenCLEngine
+from lnocl.core.runs.halves import Halves
+from lnocl.core.runs.run import Run, complete_together, make_runs
 from lnocl.core.runs.start import Setup, make_start
 from lnocl.core.scene.penalty import Penalty
+from lnocl.core.scene.star_prior import StarPrior
+from lnocl.errors import DeviceError, InputError
 from lnocl.process import ignored_warnings
 
 # So many iterations, of which one member makes some while the others rest.
@@ -26,12 +31,12 @@ KINDS = {
 }
 
 
-def starts_of(kind):
+def starts_of(kind, engine="opencl", **options):
     """Return starts that differ in their images: with much light, a third of it, and much."""
     solver, precision = KINDS[kind]
     observation = observe(kind)[0].replace(psf_error=0.0)
     with ignored_warnings():  # of stars masked at their peaks
-        setup = Setup(observation, STARS, 0, solver, precision, "opencl", None)
+        setup = Setup(observation, STARS, 0, solver, precision, engine, None, **options)
         start = make_start(setup, Penalty(0.01, smoothing=0.3))
     shares, rng = (1.0, 0.3, 1.0), np.random.default_rng(8)
     counts = (rng.poisson(np.maximum(share * observation.images, 0.0)) for share in shares)
@@ -108,11 +113,76 @@ def test_a_start_leaves_members_alone_that_go_on():
     same(found_by(runs[1]), found_by(runs[2]))
 
 
-def test_ticks_are_shared():
-    """Members that are told to go on are all iterated by the ticks of one."""
-    runs = make_runs(starts_of("masked"), LAST)
+def test_a_start_that_is_refused_leaves_its_member_at_rest():
+    starts = starts_of("masked")
+    runs = make_runs(starts, LAST)
+    observation, prior = starts[0].scene.observation, StarPrior(np.full(2, 1e300), np.ones(2))
+    runs[0].scene.star_prior = prior
+    with pytest.raises(InputError, match="cannot be held"):
+        runs[0].repeat(starts[0], observation)
+    assert not any(run.engine.look().going for run in runs)
+    runs[0].scene.star_prior = None
+    runs[0].repeat(starts[0], observation)
+    complete_together(runs)
+    assert [run.done for run in runs] == 3 * [LAST]
+
+
+def ticks_of(runs, monkeypatch):
+    ticks, tick = [], OpenCLEngine.tick
+    monkeypatch.setattr(OpenCLEngine, "tick", lambda engine: (ticks.append(1), tick(engine)))
+    complete_together(runs)
+    return len(ticks)
+
+
+@pytest.mark.parametrize("stride", [1, 64])
+def test_ticks_are_shared(stride, monkeypatch):
+    """However often a run is looked at; and what fails then fails behind proven kernels."""
+    runs = make_runs(2 * starts_of("masked")[:1], LAST)
     for run in runs:
-        run.goal = BEFORE
-        run.set_off()
-    runs[2].engine.finish()
-    assert [run.engine.look().done for run in runs] == 3 * [BEFORE]
+        run.stride = stride
+    assert ticks_of(runs, monkeypatch) < 1.5 * LAST
+    assert runs[1].engine.is_proven
+
+
+def test_halves_share_ticks_from_snapshot_to_snapshot(monkeypatch):
+    ticks, tick = [], OpenCLEngine.tick
+    monkeypatch.setattr(OpenCLEngine, "tick", lambda engine: (ticks.append(1), tick(engine)))
+    (start, *_) = starts_of("masked")
+    alone = Run(start, 40)
+    alone.stride = 1
+    alone.complete()
+    n_alone, halves = len(ticks), Halves([start, start], 40, 40)
+    for run in halves._runs:
+        run.stride = 1
+    assert [*halves][-1] == 40
+    assert len(ticks) == 2 * n_alone
+
+
+def test_runs_that_fit_the_device_alone_do_not_share_ticks(monkeypatch):
+    """One buffer for all members may be larger than a device gives at once."""
+    starts = starts_of("masked")
+    expected = make_runs(starts, LAST)
+    complete_together(expected)
+    refuse = opencl.refuse_if_too_large
+    limit = 2 * max(b.size for b in expected[0].engine._memory.buffers.values()) / 3
+
+    def refused(device, sizes, count):
+        if max(sizes.values()) > limit:
+            raise DeviceError("gives less at once")
+        return refuse(device, sizes, count)
+
+    monkeypatch.setattr(opencl, "refuse_if_too_large", refused)
+    runs = make_runs(starts, LAST)
+    assert len({id(run.engine._memory.buffers) for run in runs}) == 3
+    complete_together(runs)
+    for run, other in zip(runs, expected, strict=True):
+        same(found_by(run), found_by(other))
+
+
+@pytest.mark.parametrize("engine", ["numpy", "opencl"])
+def test_where_stars_move_each_run_has_the_scaling_of_its_start(engine):
+    first, other, _ = starts_of("masked", engine, refine_positions=True)
+    other = other.at(2.0 * other.extended, other.star_fluxes, other.scene.stars)
+    runs = make_runs([first, other], LAST)
+    assert [run.engine.scaling for run in runs] == [first.scaling, other.scaling]
+    assert not np.array_equal(first.scaling.shift, other.scaling.shift)

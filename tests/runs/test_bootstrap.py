@@ -123,6 +123,16 @@ def same(one, other):
             np.testing.assert_array_equal(a, b)
 
 
+def test_batches_are_as_large_as_they_gain_by(monkeypatch):
+    sizes, make = [], bootstrap._Measuring
+    monkeypatch.setattr(
+        bootstrap, "_Measuring", lambda *given: (sizes.append(given[-1]), make(*given))[1]
+    )
+    for options in ({}, {"engine": "opencl"}, {"engine": "opencl", "refine_positions": True}):
+        run_bootstrap(solved(**options)._outcome, 12)
+    assert sizes == [1, 12, 1]
+
+
 @pytest.mark.parametrize("engine", ["numpy", "opencl"])
 def test_replicas_of_a_batch_are_bit_for_bit_as_alone(engine):
     outcome = solved(engine=engine)._outcome

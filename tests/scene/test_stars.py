@@ -179,8 +179,8 @@ def test_each_psf_is_transformed_once_and_each_star_placed_once(monkeypatch):
 class NoEngine:
     scaling = None
 
-    def __init__(self, setup, scaling, scenes, n_iter):
-        (self.scene,) = scenes
+    def __init__(self, setup, parts, n_iter):
+        ((self.scene, _),) = parts
 
     def start(self, *_):
         pass

@@ -89,7 +89,7 @@ class OpenCLEngine:
         n_in_all: int = 1,
     ) -> None:
         self.name, self.bytes_needed = "the device", 0
-        self.is_proven = self._has_ticked = False  # every kernel of an iteration was launched
+        self._n_ticks = [0]  # which all members share
         choice = choose(device)
         tell(choice)
         chosen = choice.device
@@ -153,6 +153,11 @@ class OpenCLEngine:
         other.scene, other._member, other._memory = scene, k, self._memory.of(k)
         other.take_images()
         return other
+
+    @property
+    def is_proven(self) -> bool:
+        """Whether every kernel of an iteration was launched before."""
+        return self._n_ticks[0] > 1
 
     @property
     def _spacing(self) -> int:
@@ -321,9 +326,9 @@ class OpenCLEngine:
 
     def _judge_estimate(self, steps: Steps) -> None:
         """Make the ratios of an estimate that came from the host, and record its objective."""
-        self._set(steps)
         for name, values in zip(PRIOR, self.scene.prior_of_fluxes(), strict=True):
             self._memory.upload(name, values)
+        self._set(steps)
         self._bind("rfft_rows", pixels=self._memory.buffers["extended"])()
         self._convolve()
         self._ratio()
@@ -355,7 +360,7 @@ class OpenCLEngine:
 
     def tick(self) -> None:
         """Iterate once: make a step, or one shorter than the last, which was refused."""
-        self.is_proven, self._has_ticked = self._has_ticked, True
+        self._n_ticks[0] += 1
         if self.scaling is None:
             self._correlate()
             self._scale()
@@ -421,6 +426,8 @@ class OpenCLEngine:
         self.finish()
         for name in self._stateful:
             self._memory.upload_raw(name, state[name])
+        if self.scaling is not None:  # where no step was left its stars are taken from there
+            self._memory.upload_raw("star_steps", state["star_fluxes"])
         steps = Steps(*state["steps"].tolist())
         self._judge_estimate(Steps(recorded=steps.recorded - 1))
         self._set(steps)

@@ -286,7 +286,7 @@ def bootstrap(
     if earlier is not None:
         _refuse_other(earlier, found)
         found = earlier
-    size = 1 if parallel else _together(outcome)
+    size = 1 if parallel else min(_together(outcome), max(n - found.n, 1))
     batches = [range(k, min(k + size, n)) for k in range(found.n, n, size)]
     make = partial(_Measuring, outcome, parts, seed, found.resolution, size)
     with (
@@ -328,7 +328,8 @@ def check_number(n: object, seed: object) -> None:
 def _together(outcome: Outcome) -> int:
     """Return how many replicas are reconstructed together: more of them would gain nothing."""
     pixels = outcome.scene.n_images * math.prod(outcome.scene.grid)
-    is_batch = not outcome.setup.refine_positions  # else each has an engine of its own
+    setup = outcome.setup
+    is_batch = setup.engine == "opencl" and not setup.refine_positions  # else each has an engine
     return min(max(BATCH_PIXELS // pixels, 1), MOST_TOGETHER) if is_batch else 1
 
 

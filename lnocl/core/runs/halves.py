@@ -108,10 +108,12 @@ class Halves:
         """Run both to an iteration beyond those done; return whether they get there."""
         for run in self._runs:
             run.goal = goal - self.first
-            run.set_off()
-        for run, going in zip(self._runs, self._going, strict=True):
-            while run.done < run.goal:
-                if next(going, None) is None:
+        pairs = [*zip(self._runs, self._going, strict=True)]
+        while any(run.done < run.goal for run in self._runs):
+            for run in self._runs:
+                run.set_off()
+            for run, going in pairs:
+                if run.done < run.goal and next(going, None) is None:
                     return False
         is_there, self.done = goal > self.done, goal
         return is_there

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from copy import copy
 from functools import cached_property
-from itertools import starmap
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -21,7 +21,7 @@ from lnocl.core.scene.estimate import Estimate
 from lnocl.core.scene.observation import Observation
 from lnocl.core.scene.scene import Scene
 from lnocl.core.scene.steps import NOT_FINITE, PAUSED, SETTLED
-from lnocl.errors import refuse_not_finite
+from lnocl.errors import DeviceError, refuse_not_finite
 
 if TYPE_CHECKING:
     from lnocl.core.scene.forward_model import Model
@@ -81,8 +81,8 @@ class Run:
         engine: Engine | None = None,
     ) -> None:
         self._setup, self.n_iter, self.tolerance = start.setup, n_iter, tolerance
-        of_scene = start.setup, start.scaling, [copy(start.scene)], n_iter
-        self.engine = engine or _make_engines(*of_scene)[0]
+        part = copy(start.scene), start.scaling
+        self.engine = engine or _make_engines(start.setup, [part], n_iter)[0]
         self.scene = self.engine.scene
         ahead = AHEAD_PIXELS // (self.scene.n_images * math.prod(self.scene.grid))
         self.stride, self.goal = min(max(ahead, 1), MOST_AHEAD[tolerance > 0]), n_iter
@@ -236,7 +236,7 @@ class Run:
         best = self.best_iteration()
         scaling = self.engine.scaling
         del self.engine  # the device need not hold both
-        (self.engine,) = _make_engines(self._setup, scaling, [self.scene], self.n_iter)
+        (self.engine,) = _make_engines(self._setup, [(self.scene, scaling)], self.n_iter)
         self.restore(state)
         n_iter, self.n_iter = self.n_iter, best
         self.complete()
@@ -322,10 +322,10 @@ class Run:
 def make_runs(starts: Sequence[Start], n_iter: int) -> list[Run]:
     """Return runs from starts that differ in their images alone, as a batch: they share ticks.
 
-    Where stars move each run has an engine of its own.
+    Where stars move, or arrays of all are too large for the device, each has an engine of its own.
     """
-    setup, scaling, scenes = starts[0].setup, starts[0].scaling, [copy(s.scene) for s in starts]
-    pairs = zip(starts, _make_engines(setup, scaling, scenes, n_iter), strict=True)
+    parts = [(copy(start.scene), start.scaling) for start in starts]
+    pairs = zip(starts, _make_engines(starts[0].setup, parts, n_iter), strict=True)
     return [Run(start, n_iter, engine=engine) for start, engine in pairs]
 
 
@@ -339,19 +339,23 @@ def complete_together(runs: Sequence[Run]) -> None:
 
 
 def _make_engines(
-    setup: Setup, scaling: Scaling | None, scenes: Sequence[Scene], n_iter: int
-) -> list[Engine]:
+    setup: Setup, parts: Sequence[tuple[Scene, Scaling | None]], n_iter: int
+) -> Sequence[Engine]:
+    """Return an engine for each scene and scaling."""
     # Imported where it is chosen: the reference runs where no OpenCL is installed.
     if setup.engine == "numpy":
         from lnocl.core.engines.numpy import ReferenceEngine
 
-        return [ReferenceEngine(scene, scaling) for scene in scenes]
+        return [ReferenceEngine(*each) for each in parts]
     from lnocl.core.engines.opencl import OpenCLEngine
 
-    device, n, made = (setup.precision, setup.device), len(scenes), list[Engine]()
-    size = 1 if setup.refine_positions and scenes[0].n_stars else n  # members that share ticks
-    for k in range(0, n, size):
-        counts = size, 0 if k else n
-        first = OpenCLEngine(scenes[k], *device, n_iter, None, scaling, *counts)
-        made += [first, *starmap(first.member, enumerate(scenes[k + 1 : k + size], 1))]
-    return made
+    def make(k: int, n_members: int, n_in_all: int) -> OpenCLEngine:
+        where, (scene, scaling) = (setup.precision, setup.device, n_iter), parts[k]
+        return OpenCLEngine(scene, *where, None, scaling, n_members, n_in_all)
+
+    n = len(parts)
+    if n > 1 and not (setup.refine_positions and parts[0][0].n_stars):
+        with suppress(DeviceError):  # as arrays of one may be given, if not of all
+            first = make(0, n, n)
+            return [first, *(first.member(k, parts[k][0]) for k in range(1, n))]
+    return [make(k, 1, 0 if k else n) for k in range(n)]

@@ -133,7 +133,7 @@ def prepare(
         stars, scaling = prepare(known.scene, known, extended, stars)
         return np.append(stars, halos), scaling.holding(len(halos))
     total_weight, inverse = _back_projections(model)
-    kept = None if scene.weights is None else total_weight
+    kept = None if scene.weights is None else np.array(total_weight)  # no view of more
     information = BandMatrix(np.zeros((1, 0)), np.zeros(0, int))
     values, windows = np.zeros(0), np.zeros((0, 4), np.int32)
     if scene.n_fluxes:
