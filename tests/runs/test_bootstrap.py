@@ -123,6 +123,7 @@ def same(one, other):
             np.testing.assert_array_equal(a, b)
 
 
+@pytest.mark.exhaustive
 def test_batches_are_as_large_as_they_gain_by(monkeypatch):
     sizes, make = [], bootstrap._Measuring
     monkeypatch.setattr(
@@ -133,7 +134,7 @@ def test_batches_are_as_large_as_they_gain_by(monkeypatch):
     assert sizes == [1, 12, 1]
 
 
-@pytest.mark.parametrize("engine", ["numpy", "opencl"])
+@pytest.mark.parametrize("engine", ["numpy", pytest.param("opencl", marks=pytest.mark.exhaustive)])
 def test_replicas_of_a_batch_are_bit_for_bit_as_alone(engine):
     outcome = solved(engine=engine)._outcome
     alone, batch = Replicas(outcome, 5), Replicas(outcome, 5, 3)
