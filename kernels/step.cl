@@ -30,7 +30,8 @@ INLINE cvec scaling_at(
 /* gradient' = mu f + slope - c, c = sum_j A_j^T (r_j - w_j);
  * change_sums: <D y, s> and <D y, D y>, y = gradient' - gradient, s = f - previous,
  * D = (f + shift) a / (1 + (mu + curvature) (f + shift) a), a = 1 / sum_j A_j^T w_j.
- * spectra: n_images arrays, const, of which array 0 is the row spectrum of c. gradient: one array of pixels, updated. extended
+ * spectra: n_images arrays, const, of which array 0 is the row spectrum of c.
+ * gradient: one array of pixels, updated. extended
  * (f), previous, shift: one each, const. inverse_weight: one array of pixels, a (has_weights), or
  * one point, [2][BLOCK], for all. slope, curvature: one array of pixels each, const, those of f (is_smoothed;
  * else they count as 0). change_sums: [2][ROW_BLOCKS][2]. steps[FRESH] 0: nothing.
@@ -88,7 +89,8 @@ KERNEL void gradient_rows(
  * last step was refused f <- previous + SHORTER (f - previous) instead, which shortens d.
  * spectra <- row spectrum of f; step_sums: <gradient, d>;
  * coupling_sums: <cross_information_s, d>; square_sums: sum f^2.
- * spectra: n_images arrays, of which array 0 is out: twice the row spectrum. extended (f): one array of pixels, updated.
+ * spectra: n_images arrays, of which array 0 is out: twice the row spectrum.
+ * extended (f): one array of pixels, updated.
  * previous: one, written, or read. gradient, shift: one each, const; inverse_weight, curvature: as
  * for gradient_rows, which has D and change_sums. steps[GOING] 0: nothing.
  * cross_information: [n_stars], a window of cross_blocks blocks and cross_columns columns each;

@@ -108,6 +108,24 @@ def test_a_member_is_bit_for_bit_as_alone(kind):
     same(found_by(runs[1]), expected[1])
 
 
+@pytest.mark.parametrize("solver", ["sgm", "sgp"])
+def test_each_member_has_its_prior_of_star_fluxes(solver, monkeypatch):
+    monkeypatch.setitem(KINDS, "small", (solver, "single"))
+    found = []
+    for starts in ([each] for each in starts_of("small")), [starts_of("small")]:
+        for some in starts:
+            runs = make_runs(some, LAST)
+            for run, start in zip(runs, some, strict=True):
+                share = 0.9 + 0.01 * (start.scene.observation.images.mean() % 1.0)
+                run.scene.star_prior = StarPrior(share * start.star_fluxes, np.full(2, 0.1))
+                run.repeat(start, start.scene.observation)
+            complete_together(runs)
+            found += map(found_by, runs)
+    for alone, member in zip(found[:3], found[3:], strict=True):
+        same(member, alone)
+    assert not np.array_equal(found[0][1], found[2][1])
+
+
 def test_a_start_leaves_members_alone_that_go_on():
     starts = starts_of("small")
     alone = Run(starts[0], LAST)

@@ -111,7 +111,7 @@ class ReferenceEngine:
         self._make_gradient()
 
     def finish(self) -> None:
-        """Tick until it rests."""
+        """Tick until it rests; it shares its ticks with none."""
         while self._steps.going:
             self.tick()
 

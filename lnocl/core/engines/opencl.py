@@ -195,6 +195,7 @@ class OpenCLEngine:
         return self._launcher.bind(name, {**self._memory.buffers, **sizes, **numbers}, **others)
 
     def _bind_all(self, *names: str) -> Callable[[], object]:
+        """Return what launches several kernels, one after the other."""
         launches = list(map(self._bind, names))
         return lambda: [launch() for launch in launches]
 
@@ -352,7 +353,7 @@ class OpenCLEngine:
         self._set(replace(self.look(), **going))
 
     def finish(self) -> None:
-        """Tick until no member of the batch goes on."""
+        """Tick until all members of the batch rest."""
         while going := [steps for steps in self._decisions() if steps.going]:
             n_ticks = max(int(steps.target - steps.recorded) for steps in going)
             for _ in range(max(n_ticks, 1)):
