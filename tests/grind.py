@@ -20,6 +20,9 @@ from scenes import Recipe, worst
 from lnocl.core.opencl import launch, program
 from lnocl.core.opencl.device import choose
 from lnocl.core.opencl.tuning import Tuning
+from lnocl.core.runs.run import complete_together, make_runs
+from lnocl.core.runs.start import Setup, make_start
+from lnocl.core.scene.penalty import Penalty
 from lnocl.errors import MisfitWarning
 
 DTYPES = {"s": np.float32, "d": np.float64}
@@ -104,9 +107,10 @@ class KernelHarness(harness.KernelHarness):
 # Oclgrind 21.10 loses track of what is initialised where the host writes a part of a buffer, which
 # it takes for all of it, and where a buffer gets the place of one that was released.
 PUT_PART = """
-kernel void put_part(global uint *to, global const uint *from, const uint offset)
+kernel void put_part(
+    global uint *to, global const uint *from, const uint offset, const uint first)
 {
-    to[offset + get_global_id(0)] = from[get_global_id(0)];
+    to[offset + get_global_id(0)] = from[first + get_global_id(0)];
 }
 """
 
@@ -131,8 +135,10 @@ def keep_track():
     def put_part(context):
         return cl.Program(context, PUT_PART).build().put_part
 
-    def copied(queue, to, given, *, dst_offset=0, byte_count=None, **others):
-        if not isinstance(to, cl.Buffer) or (dst_offset == 0 and to.size == nbytes_of(given)):
+    def copied(queue, to, given, *, dst_offset=0, src_offset=0, byte_count=None, **others):
+        if not isinstance(to, cl.Buffer):
+            return copy(queue, to, given, src_offset=src_offset, **others)
+        if dst_offset == 0 and to.size == nbytes_of(given):
             return copy(queue, to, given, **others)
         if isinstance(given, cl.Buffer):
             size = byte_count
@@ -140,7 +146,13 @@ def keep_track():
             size, flags = given.nbytes, cl.mem_flags.COPY_HOST_PTR
             given = cl.Buffer(queue.context, flags, hostbuf=np.ascontiguousarray(given))
         event = put_part(queue.context)(
-            queue, (size // 4,), None, to, given, np.uint32(dst_offset // 4)
+            queue,
+            (size // 4,),
+            None,
+            to,
+            given,
+            np.uint32(dst_offset // 4),
+            np.uint32(src_offset // 4),
         )
         event.wait()
         return event
@@ -230,6 +242,18 @@ def run_deconvolution(case, dtype):
         )
         assert "Oclgrind" in found.device
         assert worst(found.extended, expected.extended) <= 1e-4
+    run_batch(recipes["sgp"].make(), precision)
+
+
+def run_batch(made, precision):
+    """Iterate two members together, each image behind a transmission of its own."""
+    shares = np.linspace(0.5, 1.0, made.images[0].size).reshape(made.images[0].shape)
+    observation = made.observation().replace(transmission=np.array([shares, shares[::-1]]))
+    setup = Setup(observation, made.stars, 0, "sgp", precision, "opencl", None)
+    start = make_start(setup, Penalty(1e-3, smoothing=1e-2))
+    runs = make_runs([start, start], 2)
+    complete_together(runs)
+    assert (runs[0].extended() == runs[1].extended()).all()
 
 
 def main(case, dtype, old=None, new=None, kernel=None):

@@ -27,7 +27,6 @@ DEFINITION = re.compile(r"\b(?:KERNEL|(?:__)?kernel)\s+void\s+(\w+)")
 REPORT = re.compile(r"^(\S.*)\n\tKernel: (\w+)$((?:\n\t.*)*)", re.MULTILINE)
 # Only transforms that are tested by themselves use them.
 NOT_IN_A_DECONVOLUTION = {"irfft_rows", "fft_columns", "ifft_columns", *comparison.SHEARED}
-NOT_IN_A_DECONVOLUTION |= {"transmit_rows", "gather_rows"}
 
 BUILD_OPTIONS = "-O0 -disable-llvm-passes"
 OPTIONS = ["--data-races", "--uniform-writes", "--uninitialized", "--max-errors", "100000"]

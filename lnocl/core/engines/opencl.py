@@ -216,10 +216,12 @@ class OpenCLEngine:
 
     def _upload_scene(self) -> None:
         scene, memory = self.scene, self._memory
-        memory.clear("steps", of_all=True)
+        # Members that were not started are summed up too, and images that do not show a star.
+        for name in memory.buffers:
+            if name == "steps" or name.endswith("_sums"):
+                memory.clear(name, of_all=True)
         if self._turned:
             self._turned.upload(memory)
-        memory.clear("star_sums", of_all=True)  # in images that do not show a star they stay 0
         self.take_images()
         has_map = scene.weights is not None and scene.has_exposure_map
         self._upload_map("exposure", np.asarray(scene.weights if has_map else [1.0]), 0.0)

@@ -98,8 +98,7 @@ class TurnedImages:
         memory.upload("column_weights", np.array([each.column_weights for each in shears]))
         weights = [each.pack_image_weights(block) for each in shears]
         memory.upload("image_weights", np.array(weights))
-        for name in ("ratio_columns", "ratio_sums"):
-            memory.clear(name, of_all=True)  # where no row of a block was observed it stays so
+        memory.clear("ratio_columns", of_all=True)  # so it stays in blocks without observed rows
         if self._n_lines:
             memory.upload_raw("firsts", np.concatenate([each.line_firsts for each in shears]))
             memory.upload("weights", np.concatenate([each.line_weights for each in shears]))
