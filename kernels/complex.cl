@@ -4,6 +4,11 @@ typedef struct {
     vec re, im;
 } cvec;
 
+/* One complex number, of one lane. */
+typedef struct {
+    real re, im;
+} scalar;
+
 /* A vector of the reals from p on, which need not lie where vectors do. */
 #if LANES == 1
 #define LOAD_UNALIGNED(p) (*(p))
@@ -14,6 +19,8 @@ typedef vec unaligned_vec __attribute__((aligned(sizeof(real))));
 
 /* Point i of a block; x is already at this work-item's vector of the block. */
 #define LOAD(x, i) ((cvec){(x)[2 * (i) * SIDE], (x)[(2 * (i) + 1) * SIDE]})
+/* Where butterfly x of the outer pass has its first point, in the lines that begin at p. */
+#define FROM_POINT(p, x, lane) ((p) + 2 * (x) * SIDE + (lane))
 /* The same of a map, or its one point where that holds for all; a product would take registers. */
 #define LOAD_MAP(x, has_map, i) LOAD(x, (i) & -(has_map))
 #define STORE(x, i, value)                      \

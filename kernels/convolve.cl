@@ -11,31 +11,11 @@
  * which are neighbours in reversed order. Here columns are folded so; ratio.cl folds the rows.
  */
 
-/* What a column block holds while it goes through the images lies in the scratch where that has room
- * for two blocks, else in array 0 of the spectra; `z` is the block that is transformed.
- */
-#if SCRATCH_BLOCKS > 1
-#define HELD SCRATCH
-#define SCRATCH_POINTS (NY + IMAGE_NY)
-#define SCRATCH_OF(scratch, columns)                       \
-    HELD vec *held = OWN_SCRATCH(scratch, SCRATCH_POINTS); \
-    SCRATCH vec *z = held + 2 * NY * SIDE
-#else
-#define HELD __global
-#define SCRATCH_POINTS NY
-#define SCRATCH_OF(scratch, columns) \
-    HELD vec *held = columns;        \
-    SCRATCH vec *z = OWN_SCRATCH(scratch, SCRATCH_POINTS)
-#endif
-
-/* Where the opposite of point t of column 0 begins, in reals; one point stands for `share` points. */
-#define OPPOSITE(t, share) (2 * (opposite_place(t, NY) / (share)) * BLOCK)
-
 /* a plus what column 0 gets from its opposite point p: (re + i im) conj(p). */
-INLINE cvec add_edge(const cvec a, const real re, const real im, const real p_re, const real p_im)
+INLINE cvec add_edge(const cvec a, const real re, const real im, const scalar p)
 {
     return (cvec){
-        a.re + FIRST_LANE * (re * p_re + im * p_im), a.im + FIRST_LANE * (im * p_re - re * p_im)
+        a.re + FIRST_LANE * (re * p.re + im * p.im), a.im + FIRST_LANE * (im * p.re - re * p.im)
     };
 }
 
@@ -53,27 +33,26 @@ KERNEL void otf_columns(
     const int n_images, __global const real *restrict column_roots, SCRATCH vec *restrict scratch)
 {
     const real norm = (real)1 / 4 / NX / NY;
-    SCRATCH vec *z = OWN_SCRATCH(scratch, NY);
+    LINES_IN(z, scratch, NY);
     OF_MEMBER(spectra, (size_t)n_images * SPECTRA_SIZE);
     OF_MEMBER(steps, N_NUMBERS);
     FOR_EACH_BLOCK_IF(steps[GOING], block, COLUMN_BLOCKS) {
         __global vec *k = otfs + (size_t)image * PIXELS_SIZE + (size_t)block * NY * 2 * SIDE;
         forward_columns(z, spectra + (size_t)block * ROWS * 2 * SIDE, NY, column_roots);
-        FOR_EACH(i, NY * 2 * SIDE)
-            k[i] = z[i] * norm;
-        BARRIER;
-        if (block == 0) {
-            FOR_EACH(t, NY) {
-                SCRATCH const real *p = (SCRATCH const real *)z + 2 * t * BLOCK;
-                SCRATCH const real *q = (SCRATCH const real *)z + OPPOSITE(t, 1);
-                const real a_re = p[0] + q[0], a_im = p[BLOCK] - q[BLOCK];
-                const real b_re = p[BLOCK] + q[BLOCK], b_im = q[0] - p[0];
-                __global real *column_0 = (__global real *)k + 2 * t * BLOCK;
-                column_0[0] = (a_re + b_re) * norm / 4;
-                column_0[BLOCK] = (a_im + b_im) * norm / 4;
+        show_column_0(z, NY, block);
+        FOR_EACH_POINT(i, NY) {
+            const int t = PLACE_OF(i, NY), lane = LANE_OF(i);
+            cvec a = times(POINT(z, i), norm);
+            if (block == 0 && lane == 0) {
+                const scalar p = OWN_OF_COLUMN_0(z, i, t), q = OPPOSITE(z, i, t, 1);
+                const real a_re = p.re + q.re, a_im = p.im - q.im;
+                const real b_re = p.im + q.im, b_im = q.re - p.re;
+                a.re = (1 - FIRST_LANE) * a.re + FIRST_LANE * ((a_re + b_re) * norm / 4);
+                a.im = (1 - FIRST_LANE) * a.im + FIRST_LANE * ((a_im + b_im) * norm / 4);
                 otf_edges[2 * (image * NY + t)] = (a_re - b_re) * norm / 4;
                 otf_edges[2 * (image * NY + t) + 1] = (a_im - b_im) * norm / 4;
             }
+            SET_OTF_POINT(k, i, t, a);
         }
         BARRIER;
     }
@@ -103,21 +82,21 @@ INLINE cvec shifted(
             * ((NY / PHASE_ROWS + PHASE_ROWS) * 2 * SIDE))
 #endif
 
-/* Point t of a column of an image, in reversed order: the sum of OVERSAMPLE points of otfs_j FFT(f).
+/* Point i of an image's columns, in reversed order: the sum of OVERSAMPLE points of otfs_j FFT(f).
  * `k` and `edge` are those of image and block; `edges` tells whether this is column 0.
  */
 INLINE cvec convolved(
-    HELD const vec *source, __global const vec *k, __global const real *edge, const int t,
-    const int lane, const bool edges)
+    const HELD_LINES source, __global const vec *k, __global const real *edge, const int i,
+    const bool edges)
 {
     cvec total;
     UNROLL
     for (int q = 0; q < OVERSAMPLE; ++q) {
-        const int point = t * OVERSAMPLE + q;
-        cvec a = multiply(LOAD(source + lane, point), LOAD(k + lane, point));
+        const int place = PLACE_OF(i, IMAGE_NY) * OVERSAMPLE + q;
+        cvec a = multiply(POINT_OF_SKY(source, i, q), OTF_POINT(k, i, q, OVERSAMPLE, place));
         if (edges) {
-            HELD const real *opposite = (HELD const real *)source + OPPOSITE(point, 1);
-            a = add_edge(a, edge[2 * point], edge[2 * point + 1], opposite[0], opposite[BLOCK]);
+            const int at = i * OVERSAMPLE + q;
+            a = add_edge(a, edge[2 * place], edge[2 * place + 1], OPPOSITE_HELD(source, at, place));
         }
         total = q > 0 ? add(total, a) : a;
     }
@@ -147,25 +126,18 @@ KERNEL void convolve_columns(
         const int block = unit % COLUMN_BLOCKS, sky = unit / COLUMN_BLOCKS;
         __global vec *columns =
             spectra + (size_t)sky * SPECTRA_SIZE + (size_t)block * ROWS * 2 * SIDE;
-        SCRATCH_OF(scratch, columns);
-#if SCRATCH_BLOCKS > 1
-        forward_columns(held, columns, NY, column_roots);
-#else
-        forward_columns(z, columns, NY, column_roots);
-        FOR_EACH(i, NY * 2 * SIDE)
-            held[i] = z[i];
-        BARRIER;
-#endif
+        LINES_AND_HELD(z, held, scratch, columns);
+        forward_columns(FIRST_HELD(z, held), columns, NY, column_roots);
+        HOLD(held, z);
         for (int own = n_own - 1; own >= 0; --own) {
             const int image = sky + own;
             __global vec *to = columns + (size_t)own * SPECTRA_SIZE;
             __global const vec *k =
                 otfs + (size_t)image * PIXELS_SIZE + (size_t)block * NY * 2 * SIDE;
             __global const real *edge = otf_edges + 2 * image * NY;
-            FOR_EACH(piece, IMAGE_NY * SIDE) {
-                const int t = piece / SIDE, lane = piece % SIDE;
-                STORE(z + lane, t, convolved(held, k, edge, t, lane, block == 0 && lane == 0));
-            }
+            show_column_0(held, NY, block);
+            FOR_EACH_POINT(i, IMAGE_NY)
+                SET_POINT(z, i, convolved(held, k, edge, i, block == 0 && LANE_OF(i) == 0));
             BARRIER;
             dit_inner(z, IMAGE_NY, image_column_roots);
 #if HAS_TURNS
@@ -205,7 +177,7 @@ KERNEL void correlate_columns(
         const int block = unit % COLUMN_BLOCKS, sky = unit / COLUMN_BLOCKS;
         __global vec *columns =
             spectra + (size_t)sky * SPECTRA_SIZE + (size_t)block * ROWS * 2 * SIDE;
-        SCRATCH_OF(scratch, columns);
+        LINES_AND_HELD(z, held, scratch, columns);
         for (int own = 0; own < n_own; ++own) {
             const int image = sky + own;
             __global const vec *from = columns + (size_t)own * SPECTRA_SIZE;
@@ -224,29 +196,23 @@ KERNEL void correlate_columns(
 #else
             forward_columns(z, from, IMAGE_NY, image_column_roots);
 #endif
-            FOR_EACH(piece, NY * SIDE) {
-                const int t = piece / SIDE, lane = piece % SIDE;
-                const cvec a = LOAD(z + lane, t / OVERSAMPLE);
-                cvec product = multiply_conjugate(a, LOAD(k + lane, t));
-                if (block == 0 && lane == 0) {
-                    __global const real *edge = otf_edges + 2 * (image * NY + t);
-                    SCRATCH const real *opposite =
-                        (SCRATCH const real *)z + OPPOSITE(t, OVERSAMPLE);
-                    product = add_edge(product, edge[0], -edge[1], opposite[0], opposite[BLOCK]);
+            show_column_0(z, IMAGE_NY, block);
+            FOR_EACH_POINT(i, NY) {
+                const int place = PLACE_OF(i, NY);
+                cvec product =
+                    multiply_conjugate(POINT_OF_IMAGE(z, i), OTF_POINT(k, i, 0, 1, place));
+                if (block == 0 && LANE_OF(i) == 0) {
+                    __global const real *edge = otf_edges + 2 * (image * NY + place);
+                    product =
+                        add_edge(product, edge[0], -edge[1], OPPOSITE(z, i, place, OVERSAMPLE));
                 }
                 if (own > 0)
-                    product = add(product, LOAD(held + lane, t));
-                STORE(held + lane, t, product);
+                    product = add(product, POINT(held, i));
+                SET_POINT(held, i, product);
             }
             BARRIER;
         }
-#if SCRATCH_BLOCKS > 1
-        z = held;
-#else
-        FOR_EACH(i, NY * 2 * SIDE)
-            z[i] = held[i];
-        BARRIER;
-#endif
+        TAKE_HELD(z, held);
         dit_inner(z, NY, column_roots);
         finish_columns(columns, z, NY, column_roots);
     }

@@ -284,7 +284,7 @@ KERNEL void collect_sums(
             decide(steps, objectives, objective);
     }
     const int n_units = n_images * star_blocks;
-    FOR_EACH_BLOCK(s, n_stars) {
+    for (int s = get_group_id(0); s < n_stars; s += get_num_groups(0)) {
         const real_sum star = sum_group(sum_pairs(star_sums + 2 * s * n_units, n_units), shared);
         store_pair(star_totals + 2 * s, star);
         const real correction = 1 + (star.sum + star.lost) / star_weights[s];

@@ -9,6 +9,8 @@
  *                   odd factor of an axis, and radices of its transform, see fft.cl
  *   IMAGE_ROW_OUTER, IMAGE_ROW_LAST, IMAGE_COLUMN_OUTER, IMAGE_COLUMN_LAST
  *                   the same of the images' axes, whose odd factors are those of the sky's
+ *   IN_REGISTERS    0 or 1: whether work-items hold the lines that they transform: registers.cl, else
+ *                   scratch.cl
  *   CHUNK           points of a transform that are finished before the next are begun
  *   SCRATCH_IS_GLOBAL   0 or 1: where a block lies while it is transformed
  *   SCRATCH_BLOCKS  1 or 2: blocks of columns that the scratch has room for
@@ -27,7 +29,7 @@
  *             of the sky; those of an image have IMAGE_NY and IMAGE_NX
  *   spectra   [NX / 2 / BLOCK][ROWS][2][BLOCK]   lanes are columns; real part, imaginary part;
  *             of an image IMAGE_NY of the rows are used
- *   otf       [NX / 2 / BLOCK][NY][2][BLOCK]     as spectra
+ *   otf       [NX / 2 / BLOCK][NY][2][BLOCK]     as spectra, or in the order of registers.cl
  * A block of BLOCK reals is SIDE vectors of LANES reals.
  */
 
@@ -81,7 +83,8 @@ typedef PASTE(BITS, WIDTH) ivec;
 #define UNROLL_IN_GROUPS
 #endif
 #define KERNEL __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
-#define ITEM ((int)get_local_id(0))
+/* That it is less than GROUP, a power of two, compilers need to be told. */
+#define ITEM ((int)get_local_id(0) & (GROUP - 1))
 #if GROUP > 1
 #define BARRIER barrier(CLK_LOCAL_MEM_FENCE | CLK_GLOBAL_MEM_FENCE)
 #else
@@ -133,9 +136,16 @@ enum {
  */
 #define OF_MEMBER(p, size) ((p) += get_group_id(1) * (size))
 
-/* Shares n blocks among however many work-groups were launched. */
+/* Shares n blocks among however many work-groups were launched: as many as there are blocks where lines lie in
+ * registers, as addresses that hold for every round of a loop would stay in more of them.
+ */
+#if IN_REGISTERS
+#define FOR_EACH_BLOCK(block, n) \
+    for (int block = get_group_id(0), is_due_ = 1; is_due_ && block < (n); is_due_ = 0)
+#else
 #define FOR_EACH_BLOCK(block, n) \
     for (int block = get_group_id(0); block < (n); block += get_num_groups(0))
+#endif
 
 /* The same, but nothing where a number of a run is 0: so a tick is a branch where it has ended. */
 #define FOR_EACH_BLOCK_IF(number, block, n) FOR_EACH_BLOCK(block, (number) != 0 ? (n) : 0)

@@ -69,29 +69,9 @@ INLINE vec ratio(const vec g, const vec m, vec *term)
     return hidden ? (vec)0 : r - 1;
 }
 
-/* Sums of the OVERSAMPLE frequencies that are one in an image, neighbours in reversed order. */
-INLINE SCRATCH vec *fold_rows(SCRATCH vec *z)
-{
-#if OVERSAMPLE == 1
-    return z;
-#else
-    SCRATCH vec *folded = z + 2 * SIDE * NX;
-    FOR_EACH(piece, IMAGE_NX * SIDE) {
-        const int t = piece / SIDE, lane = piece % SIDE;
-        cvec a = LOAD(z + lane, t * OVERSAMPLE);
-        UNROLL
-        for (int q = 1; q < OVERSAMPLE; ++q)
-            a = add(a, LOAD(z + lane, t * OVERSAMPLE + q));
-        STORE(folded + lane, t, a);
-    }
-    BARRIER;
-    return folded;
-#endif
-}
-
 /* z <- r_j - w_j, from A_j f in a block of rows of an image; ratio_sums and star_sums of the block. */
 INLINE void compare(
-    SCRATCH vec *z, __global real *ratio_sums, __global real *star_sums, __global const vec *images,
+    LINES z, __global real *ratio_sums, __global real *star_sums, __global const vec *images,
     __global const vec *background, const int has_background_map, __global const vec *exposure,
     const int has_exposure_map, __global const vec *star_images, __global const int *star_corners,
     __global const int *star_near, __global const real *star_fluxes, const int n_images,
@@ -100,35 +80,35 @@ INLINE void compare(
 {
     const size_t at = (size_t)image * IMAGE_SIZE + (size_t)block * IMAGE_NX * 2 * SIDE;
     const int unit = image * IMAGE_ROW_BLOCKS + block;
-    for (int i = star_near[unit]; i < star_near[unit + 1]; ++i) {
-        const int s = star_near[i], w = s * n_images + image;
+    for (int near = star_near[unit]; near < star_near[unit + 1]; ++near) {
+        const int s = star_near[near], w = s * n_images + image;
         const int window = window_block(star_corners, w, star_blocks, block, IMAGE_ROW_BLOCKS);
         __global const vec *star = WINDOW_BLOCK(star_images, window, star_columns);
         const real flux = star_fluxes[s];
-        FOR_EACH(piece, star_columns * SIDE) {
-            const int column = piece / SIDE, lane = piece % SIDE;
-            const int pixel = window_pixel(star_corners, w, column, IMAGE_NX);
-            const cvec m = LOAD(z + lane, pixel), p = LOAD(star + lane, column);
-            const cvec sum = {m.re + flux * p.re, m.im + flux * p.im};
-            STORE(z + lane, pixel, sum);
+        const int corner = star_corners[2 * w + 1];
+        FOR_EACH_IN_WINDOW(i, corner, star_columns, IMAGE_NX) {
+            const int own = IN_LINES(i, corner, IMAGE_NX);
+            const cvec p = LOAD(star + LANE_OF(i), COLUMN_OF(i, corner, IMAGE_NX));
+            const cvec m = POINT(z, own), sum = {m.re + flux * p.re, m.im + flux * p.im};
+            SET_POINT(z, own, sum);
         }
         BARRIER;
     }
     background += has_background_map ? at : image * 2 * SIDE;
     exposure += has_exposure_map * at;
     vec_sum objective = {0, 0};
-    FOR_EACH(piece, IMAGE_NX * SIDE) {
-        const int pixel = piece / SIDE, lane = piece % SIDE;
-        const cvec g = LOAD(images + at + lane, pixel);
-        const cvec b = LOAD_MAP(background + lane, has_background_map, pixel);
-        const cvec w = LOAD_MAP(exposure + lane, has_exposure_map, pixel);
-        cvec a = add(LOAD(z + lane, pixel), b), term;
+    FOR_EACH_POINT(i, IMAGE_NX) {
+        const cvec g = LOAD(OWN_LINE(images + at, i), ALONG(i));
+        const cvec b =
+            LOAD_MAP(OWN_MAP(background, has_background_map, i), has_background_map, ALONG(i));
+        const cvec w = LOAD_MAP(OWN_MAP(exposure, has_exposure_map, i), has_exposure_map, ALONG(i));
+        cvec a = add(POINT(z, i), b), term;
         a.re = ratio(g.re, a.re, &term.re);
         a.im = ratio(g.im, a.im, &term.im);
         a = (cvec){a.re * w.re, a.im * w.im};
         term = (cvec){term.re * w.re, term.im * w.im};
         ACCUMULATE(objective, term.re + term.im);
-        STORE(z + lane, pixel, a);
+        SET_POINT(z, i, a);
     }
     BARRIER;
     sum_products(
@@ -165,7 +145,7 @@ KERNEL void ratio_rows(
     SCRATCH vec *restrict scratch)
 {
     SHARED_SUMS(shared);
-    SCRATCH vec *wide = OWN_SCRATCH(scratch, NX + (OVERSAMPLE > 1 ? IMAGE_NX : 0));
+    LINES_IN(wide, scratch, NX + (OVERSAMPLE > 1 ? IMAGE_NX : 0));
     OF_MEMBER(spectra, (size_t)n_images * SPECTRA_SIZE);
     OF_MEMBER(ratio_sums, IMAGE_ROW_BLOCKS * n_images * 2);
     OF_MEMBER(star_sums, (size_t)n_stars * n_images * star_blocks * 2);
@@ -176,7 +156,7 @@ KERNEL void ratio_rows(
         const int block = unit / n_images, image = unit % n_images;
         __global vec *row_spectra = spectra + (size_t)image * SPECTRA_SIZE;
         read_tiles(wide, row_spectra, block);
-        SCRATCH vec *z = fold_rows(wide);
+        LINES z = fold_rows(wide);
         dit_inner(z, IMAGE_NX, image_row_roots);
         finish_rows(z, IMAGE_NX, image_row_roots);
         compare(

@@ -5,18 +5,17 @@ INLINE vec not_below_0(const vec x)
     return x < 0 ? (vec)0 : x;
 }
 
-/* Scales the points x, x + INNER(NX), ... of a line, whose corrections c a[] has, in place; their sum of
- * f^2. It is called with a literal is_smoothed, and mu 0: branches in the loop would leave a[] in memory.
+/* Scales the points of a butterfly, 0, INNER(NX), ... from the pointers on, whose corrections c a[] has, in place;
+ * their sum of f^2. It is called with a literal is_smoothed, and mu 0: branches in the loop would leave a[] in memory.
  */
 INLINE vec scale_points(
     cvec *a, __global vec *extended, __global const vec *inverse_weight, __global const vec *slope,
-    __global const vec *curvature, const int x, const int has_weights, const int is_smoothed,
-    const real mu)
+    __global const vec *curvature, const int has_weights, const int is_smoothed, const real mu)
 {
     vec squares = 0;
     UNROLL_IN_GROUPS
     for (int q = 0; q < OUTER(NX); ++q) {
-        const int pixel = q * INNER(NX) + x;
+        const int pixel = q * INNER(NX);
         const cvec f = LOAD(extended, pixel);
         const cvec weight = LOAD_MAP(inverse_weight, has_weights, pixel);
         const cvec curved = smoothing_at(curvature, pixel, is_smoothed);
@@ -58,7 +57,7 @@ KERNEL void scale_rows(
     const int n_images, __global const real *restrict row_roots, SCRATCH vec *restrict scratch)
 {
     SHARED_SUMS(shared);
-    SCRATCH vec *z = OWN_SCRATCH(scratch, NX);
+    LINES_IN(z, scratch, NX);
     OF_MEMBER(spectra, (size_t)n_images * SPECTRA_SIZE);
     OF_MEMBER(extended, PIXELS_SIZE);
     OF_MEMBER(square_sums, 2 * ROW_BLOCKS);
@@ -74,19 +73,21 @@ KERNEL void scale_rows(
             const int x = piece / SIDE, lane = piece % SIDE;
             cvec a[OUTER(NX)];
             vec squares;
-            load_inverse(a, z + lane, x, NX, row_roots);
-            __global vec *source = extended + at + lane;
-            __global const vec *weight = inverse_weight + has_weights * at + lane;
-            __global const vec *down = slope + at + lane, *curved = curvature + at + lane;
+            load_inverse(a, OF_LANE(z, lane), x, NX, row_roots);
+            __global vec *source = FROM_POINT(extended + at, x, lane);
+            __global const vec *weight =
+                FROM_POINT(inverse_weight + has_weights * at, x & -has_weights, lane);
+            __global const vec *down = FROM_POINT(slope + at, x, lane);
+            __global const vec *curved = FROM_POINT(curvature + at, x, lane);
             /* A pass of its own over the pixels takes longer here. */
             if (is_smoothed)
-                squares = scale_points(a, source, weight, down, curved, x, has_weights, 1, mu);
+                squares = scale_points(a, source, weight, down, curved, has_weights, 1, mu);
             else if (mu != 0)
-                squares = scale_points(a, source, weight, down, curved, x, has_weights, 0, mu);
+                squares = scale_points(a, source, weight, down, curved, has_weights, 0, mu);
             else
-                squares = scale_points(a, source, weight, down, curved, x, has_weights, 0, 0);
+                squares = scale_points(a, source, weight, down, curved, has_weights, 0, 0);
             ACCUMULATE(total, squares);
-            store_forward(z + lane, a, x, NX, row_roots);
+            store_forward(OF_LANE(z, lane), a, x, NX, row_roots);
         }
         store_pair(square_sums + 2 * block, sum_group(sum_lanes(total), shared));
         BARRIER;

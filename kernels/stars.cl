@@ -19,32 +19,24 @@ INLINE int window_block(
     return w * n_blocks + (ahead < 0 ? ahead + row_blocks : ahead);
 }
 
-/* The pixel of a row of nx in which a column of window w lies. */
-INLINE int window_pixel(__global const int *corners, const int w, const int column, const int nx)
-{
-    const int pixel = corners[2 * w + 1] + column;
-    return pixel < nx ? pixel : pixel - nx;
-}
-
 #define WINDOW_BLOCK(windows, block, columns) ((windows) + (size_t)(block) * ((columns) * 2 * SIDE))
 
 /* sums of each star near block b: of the products of its window and of z, a block of rows of nx. */
 INLINE void sum_products(
-    __global real *sums, SCRATCH const vec *z, __global const vec *windows,
-    __global const int *corners, __global const int *near, const int n_arrays, const int array,
-    const int n_blocks, const int n_columns, const int b, const int row_blocks, const int nx,
-    __local real_sum *shared)
+    __global real *sums, const LINES z, __global const vec *windows, __global const int *corners,
+    __global const int *near, const int n_arrays, const int array, const int n_blocks,
+    const int n_columns, const int b, const int row_blocks, const int nx, __local real_sum *shared)
 {
     const int unit = array * row_blocks + b;
-    for (int i = near[unit]; i < near[unit + 1]; ++i) {
-        const int w = near[i] * n_arrays + array;
+    for (int at = near[unit]; at < near[unit + 1]; ++at) {
+        const int w = near[at] * n_arrays + array;
         const int window = window_block(corners, w, n_blocks, b, row_blocks);
         __global const vec *star = WINDOW_BLOCK(windows, window, n_columns);
         vec_sum product = {0, 0};
-        FOR_EACH(piece, n_columns * SIDE) {
-            const int column = piece / SIDE, lane = piece % SIDE;
-            const int pixel = window_pixel(corners, w, column, nx);
-            const cvec a = LOAD(z + lane, pixel), p = LOAD(star + lane, column);
+        const int corner = corners[2 * w + 1];
+        FOR_EACH_IN_WINDOW(i, corner, n_columns, nx) {
+            const cvec p = LOAD(star + LANE_OF(i), COLUMN_OF(i, corner, nx));
+            const cvec a = POINT(z, IN_LINES(i, corner, nx));
             ACCUMULATE(product, p.re * a.re + p.im * a.im);
         }
         store_pair(sums + 2 * window, sum_group(sum_lanes(product), shared));

@@ -15,12 +15,13 @@ INLINE vec shifted_scaling(
  */
 INLINE cvec scaling_at(
     const cvec f, __global const vec *shift, __global const vec *inverse_weight,
-    __global const vec *curvature, const size_t at, const int lane, const int pixel,
-    const int has_weights, const int is_smoothed, const real mu)
+    __global const vec *curvature, const size_t at, const int i, const int has_weights,
+    const int is_smoothed, const real mu)
 {
-    const cvec z = LOAD(shift + at + lane, pixel);
-    const cvec weight = LOAD_MAP(inverse_weight + has_weights * at + lane, has_weights, pixel);
-    const cvec curved = smoothing_at(curvature + at + lane, pixel, is_smoothed);
+    const cvec z = LOAD(OWN_LINE(shift + at, i), ALONG(i));
+    const cvec weight =
+        LOAD_MAP(OWN_MAP(inverse_weight + has_weights * at, has_weights, i), has_weights, ALONG(i));
+    const cvec curved = smoothing_at(OWN_LINE(curvature + at, i), ALONG(i), is_smoothed);
     return (cvec){
         shifted_scaling(f.re, z.re, weight.re, curved.re, is_smoothed, mu),
         shifted_scaling(f.im, z.im, weight.im, curved.im, is_smoothed, mu)
@@ -47,7 +48,7 @@ KERNEL void gradient_rows(
     __global const real *restrict row_roots, SCRATCH vec *restrict scratch)
 {
     SHARED_SUMS(shared);
-    SCRATCH vec *z = OWN_SCRATCH(scratch, NX);
+    LINES_IN(z, scratch, NX);
     OF_MEMBER(spectra, (size_t)n_images * SPECTRA_SIZE);
     OF_MEMBER(change_sums, 4 * ROW_BLOCKS);
     OF_MEMBER(gradient, PIXELS_SIZE);
@@ -62,21 +63,20 @@ KERNEL void gradient_rows(
         dit_inner(z, NX, row_roots);
         finish_rows(z, NX, row_roots);
         vec_sum change_step = {0, 0}, change_change = {0, 0};
-        FOR_EACH(piece, NX * SIDE) {
-            const int pixel = piece / SIDE, lane = piece % SIDE;
-            const cvec a = LOAD(z + lane, pixel);
-            const cvec f = LOAD(extended + at + lane, pixel);
-            const cvec before = LOAD(previous + at + lane, pixel);
-            const cvec g = LOAD(gradient + at + lane, pixel);
-            const cvec down = smoothing_at(slope + at + lane, pixel, is_smoothed);
+        FOR_EACH_POINT(i, NX) {
+            const cvec a = POINT(z, i);
+            const cvec f = LOAD(OWN_LINE(extended + at, i), ALONG(i));
+            const cvec before = LOAD(OWN_LINE(previous + at, i), ALONG(i));
+            const cvec g = LOAD(OWN_LINE(gradient + at, i), ALONG(i));
+            const cvec down = smoothing_at(OWN_LINE(slope + at, i), ALONG(i), is_smoothed);
             const cvec d = scaling_at(
-                f, shift, inverse_weight, curvature, at, lane, pixel, has_weights, is_smoothed, mu);
+                f, shift, inverse_weight, curvature, at, i, has_weights, is_smoothed, mu);
             const cvec next = {mu * f.re + down.re - a.re, mu * f.im + down.im - a.im};
             const cvec change = {d.re * (next.re - g.re), d.im * (next.im - g.im)};
             ACCUMULATE(
                 change_step, change.re * (f.re - before.re) + change.im * (f.im - before.im));
             ACCUMULATE(change_change, change.re * change.re + change.im * change.im);
-            STORE(gradient + at + lane, pixel, next);
+            STORE(OWN_LINE(gradient + at, i), ALONG(i), next);
         }
         store_pair(change_sums + 2 * block, sum_group(sum_lanes(change_step), shared));
         store_pair(
@@ -112,7 +112,7 @@ KERNEL void step_rows(
     const int cross_columns, __global const real *restrict row_roots, SCRATCH vec *restrict scratch)
 {
     SHARED_SUMS(shared);
-    SCRATCH vec *z = OWN_SCRATCH(scratch, NX);
+    LINES_IN(z, scratch, NX);
     OF_MEMBER(spectra, (size_t)n_images * SPECTRA_SIZE);
     OF_MEMBER(extended, PIXELS_SIZE);
     OF_MEMBER(step_sums, 2 * ROW_BLOCKS);
@@ -132,37 +132,39 @@ KERNEL void step_rows(
         /* A pass of its own over the pixels in their order, which prefetching follows: inside the
          * transform they come from too many places at once.
          */
-        FOR_EACH(piece, is_new ? NX * SIDE : 0) {
-            const int pixel = piece / SIDE, lane = piece % SIDE;
-            const cvec f = LOAD(extended + at + lane, pixel);
-            const cvec g = LOAD(gradient + at + lane, pixel);
-            const cvec scale = scaling_at(
-                f, shift, inverse_weight, curvature, at, lane, pixel, has_weights, is_smoothed, mu);
-            const cvec trial = {
-                not_below_0(f.re - alpha * scale.re * g.re),
-                not_below_0(f.im - alpha * scale.im * g.im)
-            };
-            const cvec d = {trial.re - f.re, trial.im - f.im};
-            STORE(previous + at + lane, pixel, f);
-            STORE(extended + at + lane, pixel, trial);
-            ACCUMULATE(slope_total, g.re * d.re + g.im * d.im);
-            if (has_stars)
-                STORE(z + lane, pixel, d);
-            if (mu != 0)
-                ACCUMULATE(square_total, trial.re * trial.re + trial.im * trial.im);
-        }
-        FOR_EACH(piece, is_new ? 0 : NX * SIDE) {
-            const int pixel = piece / SIDE, lane = piece % SIDE;
-            const cvec before = LOAD(previous + at + lane, pixel);
-            const cvec f = LOAD(extended + at + lane, pixel);
-            const cvec trial = {
-                before.re + SHORTER * (f.re - before.re), before.im + SHORTER * (f.im - before.im)
-            };
-            STORE(extended + at + lane, pixel, trial);
-            if (has_stars) /* which know how they follow */
-                STORE(z + lane, pixel, trial);
-            if (mu != 0)
-                ACCUMULATE(square_total, trial.re * trial.re + trial.im * trial.im);
+        if (is_new) {
+            FOR_EACH_POINT(i, NX) {
+                const cvec f = LOAD(OWN_LINE(extended + at, i), ALONG(i));
+                const cvec g = LOAD(OWN_LINE(gradient + at, i), ALONG(i));
+                const cvec scale = scaling_at(
+                    f, shift, inverse_weight, curvature, at, i, has_weights, is_smoothed, mu);
+                const cvec trial = {
+                    not_below_0(f.re - alpha * scale.re * g.re),
+                    not_below_0(f.im - alpha * scale.im * g.im)
+                };
+                const cvec d = {trial.re - f.re, trial.im - f.im};
+                STORE(OWN_LINE(previous + at, i), ALONG(i), f);
+                STORE(OWN_LINE(extended + at, i), ALONG(i), trial);
+                ACCUMULATE(slope_total, g.re * d.re + g.im * d.im);
+                if (has_stars)
+                    SET_POINT(z, i, d);
+                if (mu != 0)
+                    ACCUMULATE(square_total, trial.re * trial.re + trial.im * trial.im);
+            }
+        } else {
+            FOR_EACH_POINT(i, NX) {
+                const cvec before = LOAD(OWN_LINE(previous + at, i), ALONG(i));
+                const cvec f = LOAD(OWN_LINE(extended + at, i), ALONG(i));
+                const cvec trial = {
+                    before.re + SHORTER * (f.re - before.re),
+                    before.im + SHORTER * (f.im - before.im)
+                };
+                STORE(OWN_LINE(extended + at, i), ALONG(i), trial);
+                if (has_stars) /* which know how they follow */
+                    SET_POINT(z, i, trial);
+                if (mu != 0)
+                    ACCUMULATE(square_total, trial.re * trial.re + trial.im * trial.im);
+            }
         }
         BARRIER;
         sum_products(
@@ -171,9 +173,10 @@ KERNEL void step_rows(
         FOR_EACH(piece, INNER(NX) * SIDE) {
             const int x = piece / SIDE, lane = piece % SIDE;
             cvec a[OUTER(NX)];
+            UNROLL_IN_GROUPS
             for (int q = 0; q < OUTER(NX); ++q)
-                a[q] = LOAD(extended + at + lane, q * INNER(NX) + x);
-            store_forward(z + lane, a, x, NX, row_roots);
+                a[q] = LOAD(FROM_POINT(extended + at, x, lane), q * INNER(NX));
+            store_forward(OF_LANE(z, lane), a, x, NX, row_roots);
         }
         store_pair(step_sums + 2 * block, sum_group(sum_lanes(slope_total), shared));
         store_pair(square_sums + 2 * block, sum_group(sum_lanes(square_total), shared));

@@ -11,7 +11,7 @@ KERNEL void transmit_rows(
     __global const vec *restrict transmission, __global const real *restrict steps,
     const int n_images, __global const real *restrict row_roots, SCRATCH vec *restrict scratch)
 {
-    SCRATCH vec *z = OWN_SCRATCH(scratch, NX);
+    LINES_IN(z, scratch, NX);
     OF_MEMBER(spectra, (size_t)n_images * SPECTRA_SIZE);
     OF_MEMBER(extended, PIXELS_SIZE);
     OF_MEMBER(steps, N_NUMBERS);
@@ -24,11 +24,12 @@ KERNEL void transmit_rows(
                 cvec a[OUTER(NX)];
                 UNROLL
                 for (int q = 0; q < OUTER(NX); ++q) {
-                    const int pixel = q * INNER(NX) + x;
-                    const cvec f = LOAD(extended + at + lane, pixel), share = LOAD(t + lane, pixel);
+                    const int pixel = q * INNER(NX);
+                    const cvec f = LOAD(FROM_POINT(extended + at, x, lane), pixel);
+                    const cvec share = LOAD(FROM_POINT(t, x, lane), pixel);
                     a[q] = (cvec){f.re * share.re, f.im * share.im};
                 }
-                store_forward(z + lane, a, x, NX, row_roots);
+                store_forward(OF_LANE(z, lane), a, x, NX, row_roots);
             }
             BARRIER;
             dif_inner(z, NX, row_roots);
@@ -48,7 +49,7 @@ KERNEL void gather_rows(
     const int n_images, __global const real *restrict row_roots, SCRATCH vec *restrict scratch)
 {
     const real norm = (real)1 / 2 / NX;
-    SCRATCH vec *z = OWN_SCRATCH(scratch, NX);
+    LINES_IN(z, scratch, NX);
     OF_MEMBER(spectra, (size_t)n_images * SPECTRA_SIZE);
     OF_MEMBER(transmitted, PIXELS_SIZE);
     OF_MEMBER(steps, N_NUMBERS);
@@ -61,18 +62,19 @@ KERNEL void gather_rows(
             FOR_EACH(piece, INNER(NX) * SIDE) {
                 const int x = piece / SIDE, lane = piece % SIDE;
                 cvec a[OUTER(NX)];
-                load_inverse(a, z + lane, x, NX, row_roots);
+                load_inverse(a, OF_LANE(z, lane), x, NX, row_roots);
                 UNROLL_IN_GROUPS
                 for (int q = 0; q < OUTER(NX); ++q) {
-                    const int pixel = q * INNER(NX) + x;
-                    const cvec share = LOAD(t + lane, pixel);
+                    const int pixel = q * INNER(NX);
+                    __global vec *sum = FROM_POINT(transmitted + at, x, lane);
+                    const cvec share = LOAD(FROM_POINT(t, x, lane), pixel);
                     a[q] = (cvec){norm * a[q].re * share.re, norm * a[q].im * share.im};
                     if (image > 0)
-                        a[q] = add(a[q], LOAD(transmitted + at + lane, pixel));
-                    STORE(transmitted + at + lane, pixel, a[q]);
+                        a[q] = add(a[q], LOAD(sum, pixel));
+                    STORE(sum, pixel, a[q]);
                 }
                 if (image == n_images - 1)
-                    store_forward(z + lane, a, x, NX, row_roots);
+                    store_forward(OF_LANE(z, lane), a, x, NX, row_roots);
             }
             BARRIER;
         }

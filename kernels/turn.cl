@@ -152,7 +152,7 @@ KERNEL void irfft_sheared(
         FOR_EACH(piece, INNER(NX) * SIDE) {
             const int x = piece / SIDE, lane = piece % SIDE;
             cvec a[OUTER(NX)];
-            load_inverse(a, z + lane, x, NX, row_roots);
+            load_inverse(a, OF_LANE(z, lane), x, NX, row_roots);
             UNROLL
             for (int q = 0; q < OUTER(NX); ++q) {
                 store_column(own, q * INNER(NX) + x, 0, lane, block, a[q].re);

@@ -47,6 +47,12 @@ CASES = {
         FOUR_TIMES_AS_FINE,
         "s",
     ),
+    "group, in registers": (
+        (24, 40),
+        Tuning(1, 2, group=4, points=20),
+        harness.TWICE_AS_FINE,
+        "s",
+    ),
     "turned": ((16, 32), Tuning(4, 4), harness.TURNED, "D"),
     "group, turned": ((32, 48), Tuning(1, 4, group=4), harness.TURNED, "s"),
     "group, exposure map": ((32, 16), Tuning(1, 8, group=4), "exposure map, mu", "s"),

@@ -5,6 +5,7 @@ import re
 from types import SimpleNamespace
 
 import numpy as np
+import pyopencl as cl
 import pytest
 from kernel_comparison import ALLOWED, deviation, kernels_of
 from kernel_harness import THREE_IMAGES, TURNED, TWICE_AS_FINE, KernelHarness, inputs
@@ -12,13 +13,20 @@ from kernel_scenes import FOUR_TIMES_AS_FINE, SCENES
 
 from lnocl.core.opencl import sources
 from lnocl.core.opencl.device import choose, context_of
-from lnocl.core.opencl.tuning import Tuning
+from lnocl.core.opencl.tuning import Tuning, candidates
 
 
-def of_gpu(*grid, oversample=1, dtype=np.float32):
+def of_gpu(*grid, oversample=1, has_turns=False, dtype=np.float32, most=1024):
     """Return the tuning of a GPU with 132 compute units and 48 KiB of local memory a group."""
-    gpu = SimpleNamespace(local_mem_size=48 * 1024, max_compute_units=132)
-    return Tuning(1, 8, group=256).fit(gpu, np.dtype(dtype), grid, oversample)
+    gpu = SimpleNamespace(
+        local_mem_size=48 * 1024,
+        max_compute_units=132,
+        max_work_group_size=most,
+        type=cl.device_type.GPU,
+    )
+    return candidates(gpu, np.dtype(dtype))[0].fit(
+        gpu, np.dtype(dtype), grid, oversample, has_turns
+    )
 
 
 # Name: (grid, tuning, scene, precisions), a capital letter for one that only CI tests. Each grid
@@ -62,7 +70,7 @@ CASES = {
     "turned, group": ((64, 64), Tuning(1, 8, group=4), TURNED, "S"),
     "turned, blocks of 1": ((64, 32), Tuning(1, 1, group=4), TURNED, "S"),
     "turned, global scratch": ((64, 32), Tuning(4, 4, scratch_is_global=True), TURNED, "S"),
-    "turned, GPU": ((512, 64), of_gpu(512, 64), TURNED, "S"),
+    "turned, GPU": ((512, 64), of_gpu(512, 64, has_turns=True), TURNED, "S"),
     "global scratch": ((64, 32), Tuning(4, 16, scratch_is_global=True), "plain", "S"),
     "several vectors a block": ((64, 32), Tuning(4, 8), "mask, mu, smoothing", "S"),
     "group": ((64, 32), Tuning(1, 8, group=4), THREE_IMAGES, "sD"),
@@ -76,8 +84,27 @@ CASES = {
     "GPU, 64": ((64, 64), of_gpu(64, 64), THREE_IMAGES, "D"),
     "GPU, 512": ((512, 512), of_gpu(512, 512), "exposure map, mu", "S"),
     "GPU, 1024": ((1024, 1024), of_gpu(1024, 1024), THREE_IMAGES, "S"),
-    "GPU, blocks of 1": ((4096, 16), of_gpu(4096, 16), "mask, mu, smoothing", "S"),
-    "GPU, sky twice as fine": ((64, 96), of_gpu(64, 96, oversample=2), TWICE_AS_FINE, "S"),
+    "GPU, blocks of 1": ((64, 32), of_gpu(64, 32, dtype=np.float64), "mask, mu, smoothing", "D"),
+    "GPU, two passes in registers": ((16, 32), of_gpu(16, 32), "mask, mu, smoothing", "s"),
+    "GPU, three passes": ((512, 1024), of_gpu(512, 1024), "two images, star, mu", "S"),
+    "GPU, last pass of radix 2": ((256, 32), of_gpu(256, 32), "exposure map, mu", "S"),
+    "GPU, odd factor 3": ((96, 192), of_gpu(96, 192), THREE_IMAGES, "S"),
+    "GPU, odd factors 3 and 5": ((80, 48), Tuning(1, 2, group=8, points=16), THREE_IMAGES, "S"),
+    "GPU, odd factors 7 and 9": ((112, 144), Tuning(1, 1, group=8, points=16), "plain", "D"),
+    "GPU, not in registers": ((4096, 16), of_gpu(4096, 16), "mask, mu, smoothing", "S"),
+    "GPU, sky twice as fine": ((64, 64), of_gpu(64, 64, oversample=2), TWICE_AS_FINE, "S"),
+    "GPU, sky twice as fine, odd": (
+        (96, 80),
+        Tuning(1, 2, group=8, points=16),
+        TWICE_AS_FINE,
+        "D",
+    ),
+    "GPU, sky four times as fine": (
+        (64, 128),
+        Tuning(1, 4, group=32, points=16),
+        FOUR_TIMES_AS_FINE,
+        "S",
+    ),
     "GPU, odd factors": ((144, 80), of_gpu(144, 80), "two images, star, mu", "D"),
 }
 DTYPES = {"s": np.float32, "d": np.float64}

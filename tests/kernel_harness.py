@@ -15,7 +15,7 @@ from lnocl.core.opencl.launch import READ_WRITE, Launcher
 from lnocl.core.opencl.layout import Layout, PixelLayout, reversed_order
 from lnocl.core.opencl.program import Program
 from lnocl.core.opencl.shears import Shears
-from lnocl.core.opencl.tuning import Tuning
+from lnocl.core.opencl.tuning import Tuning, odd_part
 from lnocl.core.opencl.windows import stars_near
 from lnocl.core.scene.rotation import Rotation
 from lnocl.core.scene.steps import Steps
@@ -293,7 +293,16 @@ class KernelHarness:
         columns[:, 0] = (otf[:, 0] + otf[:, -1]) / 2
         edge = ((otf[:, 0] - otf[:, -1]) / 2)[order]
         packed = self.layout.pack_columns(columns[order])[:, :ny]
+        if self.program.tuning.points:
+            packed = self._in_registers(packed)
         return packed, np.stack([edge.real, edge.imag], axis=-1)
+
+    def _in_registers(self, packed: NDArray) -> NDArray:
+        """Return OTFs in the order in which the items of a group hold them."""
+        blocks, ny, _, block = packed.shape
+        items, odd = self.program.tuning.group // block, odd_part(ny)
+        held = packed.reshape(blocks, odd, items, ny // items // odd, 2, block)
+        return np.ascontiguousarray(held.transpose(0, 1, 3, 4, 2, 5)).reshape(packed.shape)
 
 
 def rounded(array: ArrayLike, dtype: DTypeLike) -> NDArray:

@@ -12,6 +12,7 @@ import functools
 import numpy as np
 import pytest
 import scipy.fft
+from kernel_cases import of_gpu
 from scenes import ENGINES, Recipe, paper, placed, worst
 from scipy.special import kl_div
 
@@ -249,12 +250,17 @@ def test_objectives_are_those_of_scipy(engine, recipe):
 
 @pytest.mark.exhaustive  # such programs take a minute to build; tests/kernels has groups as well
 @pytest.mark.parametrize(
-    ("precision", "recipe"),
-    [("single", "64x256 two stars, map"), ("double", "20x50 star, mu, mask, noise")],
+    ("precision", "recipe", "tuning"),
+    [
+        ("single", "64x256 two stars, map", program.Tuning(1, 8, group=4)),
+        ("double", "20x50 star, mu, mask, noise", program.Tuning(1, 8, group=4)),
+        ("single", "64x64 four images, no background", of_gpu(64, 64)),
+        ("double", "16x32 two stars, mu, mask, noise", of_gpu(16, 32, dtype=np.float64)),
+    ],
 )
-def test_the_tuning_of_a_gpu_gives_the_same(monkeypatch, precision, recipe):
+def test_the_tuning_of_a_gpu_gives_the_same(monkeypatch, precision, recipe, tuning):
     """Several work-items share a block, whatever device there is."""
-    monkeypatch.setattr(program, "tune", lambda *_: program.Tuning(1, 8, group=4))
+    monkeypatch.setattr(program, "tune", lambda *_: tuning)
     made = RECIPES[recipe].make()
     result = made.deconvolve(n_iter=CHECKPOINTS[1], engine="opencl", precision=precision)
     extended, star_fluxes = expected(recipe)[0][CHECKPOINTS[1]]
@@ -265,7 +271,7 @@ def test_the_tuning_of_a_gpu_gives_the_same(monkeypatch, precision, recipe):
 
 @pytest.mark.exhaustive
 @pytest.mark.parametrize(
-    "tuning", [None, pytest.param(program.Tuning(1, 8, group=4), marks=pytest.mark.exhaustive)]
+    "tuning", [None, program.Tuning(1, 8, group=4), of_gpu(16, 32)], ids=["CPU", "scratch", "GPU"]
 )
 @pytest.mark.parametrize("solver", ["sgm", "sgp"])
 def test_more_stars_than_a_group_sums(monkeypatch, solver, tuning):

@@ -9,7 +9,7 @@ import pytest
 
 import lnocl
 from lnocl.core.opencl import tuning as module
-from lnocl.core.opencl.tuning import candidates, in_words, measured, store, tune
+from lnocl.core.opencl.tuning import Tuning, candidates, in_words, measured, store, tune
 
 KIB = 1024
 SINGLE, DOUBLE = np.dtype(np.float32), np.dtype(np.float64)
@@ -75,13 +75,59 @@ def test_scratch_is_global_where_a_block_does_not_fit_in_local_memory(
 )
 def test_blocks_of_a_gpu_lie_in_local_memory(local_kib, grid, dtype, block, group, is_global):
     gpu = device(cl.device_type.GPU, local_kib)
-    tuning = tune(gpu, dtype, (grid, grid))
+    tuning = Tuning(1, 8, group=256).fit(gpu, dtype, (grid, grid))
     found = tuning.block, tuning.group, tuning.scratch_is_global
     assert found == (block, group, is_global)
     sums = 2 * group * dtype.itemsize
     needed = 2 * grid * block * dtype.itemsize + sums
     assert tuning.local_bytes((grid, grid), 1, dtype) == needed
     assert is_global or needed <= local_kib * KIB
+
+
+@pytest.mark.parametrize(
+    ("local_kib", "most", "grid", "oversample", "dtype", "block", "items"),
+    [
+        (48, 1024, (64, 64), 1, SINGLE, 2, 8),  # as few passes with 8 points an item as with 16
+        (48, 1024, (256, 256), 1, SINGLE, 2, 16),
+        (48, 1024, (512, 512), 1, SINGLE, 4, 64),
+        (48, 1024, (1024, 1024), 1, SINGLE, 4, 64),
+        (48, 1024, (1024, 512), 1, SINGLE, 4, 64),
+        (48, 1024, (1024, 1024), 1, DOUBLE, 2, 128),
+        (48, 1024, (2048, 2048), 1, SINGLE, 2, 128),
+        (48, 1024, (4096, 4096), 1, SINGLE, 2, 256),
+        (48, 256, (4096, 4096), 1, SINGLE, 1, 256),  # where groups have 256 items at most
+        (48, 1024, (768, 768), 1, SINGLE, 4, 64),  # 12 points an item
+        (48, 1024, (512, 512), 2, SINGLE, 4, 32),
+    ],
+)
+def test_lines_of_a_gpu_lie_in_registers(local_kib, most, grid, oversample, dtype, block, items):
+    gpu = device(cl.device_type.GPU, local_kib)
+    gpu.max_work_group_size = most
+    tuning = tune(gpu, dtype, grid, oversample)
+    assert tuning.points
+    assert (tuning.block, tuning.group // tuning.block) == (block, items)
+    exchanged = max(max(grid) * 17 // 16 * block, 2 * grid[0])
+    needed = (exchanged + 2 * tuning.group) * dtype.itemsize
+    assert tuning.local_bytes(grid, oversample, dtype) == needed <= local_kib * KIB
+
+
+@pytest.mark.parametrize(
+    ("grid", "oversample", "has_turns", "dtype"),
+    [
+        ((1152, 1152), 1, False, SINGLE),  # an odd factor 9 leaves radices of 2
+        ((64, 2048), 1, False, SINGLE),  # too lopsided
+        ((8192, 8192), 1, False, SINGLE),  # too long for local memory
+        ((4096, 4096), 1, False, DOUBLE),
+        ((512, 512), 1, True, SINGLE),  # turned
+        ((8, 8), 4, False, SINGLE),
+    ],
+)
+def test_other_lines_lie_in_the_scratch(grid, oversample, has_turns, dtype):
+    gpu = device(cl.device_type.GPU, 48)
+    gpu.max_work_group_size = 1024
+    found = tune(gpu, dtype, grid, oversample, has_turns)
+    assert found == Tuning(1, 8, 256).fit(gpu, dtype, grid, oversample, has_turns)
+    assert not found.points
 
 
 def test_a_group_needs_room_for_its_sums_beside_the_block():
@@ -94,7 +140,10 @@ def test_a_group_needs_room_for_its_sums_beside_the_block():
 def test_each_unit_of_a_gpu_has_a_block():
     """Blocks are smaller than local memory allows where there are fewer of them than units."""
     gpu = device(cl.device_type.GPU, 1024, units=132)
-    assert [tune(gpu, SINGLE, (n, n)).block for n in (256, 1024, 2048, 4096)] == [2, 2, 4, 8]
+    cut = Tuning(1, 8, 256)
+    blocks = [cut.fit(gpu, SINGLE, (n, n)).block for n in (256, 1024, 2048, 4096)]
+    assert blocks == [2, 2, 4, 8]
+    assert [tune(gpu, SINGLE, (n, n)).block for n in (256, 1024, 2048)] == [2, 2, 2]
 
 
 def test_the_default_is_the_first_candidate():
@@ -105,7 +154,8 @@ def test_the_default_is_the_first_candidate():
     ]
     assert in_words(candidates(CPU, DOUBLE)[0], DOUBLE) == "vectors of 256 bits"
     assert [in_words(each, SINGLE) for each in candidates(GPU, SINGLE)] == [
-        f"work-groups of {n} and blocks of {block}" for block in (8, 2) for n in (256, 128, 64)
+        *(f"{n} points a work-item in registers at most" for n in (16, 8)),
+        *(f"work-groups of {n} and blocks of {block}" for block in (8, 2) for n in (256, 128, 64)),
     ]
 
 
@@ -114,7 +164,11 @@ def test_what_was_measured_is_taken_for_this_device_and_precision_alone(given):
     fastest = candidates(given, SINGLE)[1]
     assert measured(given, SINGLE) is None
     assert store(given, {SINGLE: fastest}).is_file()
-    assert measured(given, SINGLE) == fastest == tune(given, SINGLE, (1024, 1024))
+    assert (
+        measured(given, SINGLE)
+        == fastest
+        == replace(tune(given, SINGLE, (1024, 1024)), block=fastest.block, group=fastest.group)
+    )
     assert measured(given, DOUBLE) is None
     assert measured(device(given.type, 1024, "another"), SINGLE) is None
     other = device(given.type, 1024, "another")

@@ -19,10 +19,10 @@ ADVICE = "do not trust its results; try another driver or --engine numpy"
 
 # In the source of the kernels, once each: what is there, and a fault to put in its place.
 FAULTS = {
-    "correlate_columns": ("edge[0], -edge[1], opposite", "edge[0], edge[1], opposite"),
+    "correlate_columns": ("edge[0], -edge[1], OPPOSITE", "edge[0], edge[1], OPPOSITE"),
     "convolve_columns": (
-        "edge[2 * point], edge[2 * point + 1], opposite",
-        "edge[2 * point], -edge[2 * point + 1], opposite",
+        "edge[2 * place], edge[2 * place + 1], OPPOSITE",
+        "edge[2 * place], -edge[2 * place + 1], OPPOSITE",
     ),
     "step_rows": (
         "KERNEL void step_rows",

@@ -113,15 +113,15 @@ FAULTS = {
     "read behind the end": (
         "group larger than its work",
         "rfft_rows",
-        "LOAD(from + lane, q * INNER(NX) + x)",
-        "LOAD(from + lane, q * INNER(NX) + x + 1)",
+        "LOAD(FROM_POINT(from, x, lane), q * INNER(NX))",
+        "LOAD(FROM_POINT(from, x, lane), q * INNER(NX) + 1)",
         "Invalid read of size 4 at global memory",
     ),
     "write behind the end": (
         "an item a block",
         "irfft_rows",
-        "STORE(to + lane, q * INNER(NX) + x, a[q])",
-        "STORE(to + lane, q * INNER(NX) + x + 1, a[q])",
+        "STORE(FROM_POINT(to, x, lane), q * INNER(NX), a[q])",
+        "STORE(FROM_POINT(to, x, lane), q * INNER(NX) + 1, a[q])",
         "Invalid write of size 32 at global memory",
     ),
     "no barrier before a sum": (
@@ -134,9 +134,23 @@ FAULTS = {
     "no barrier before the next block": (
         "group, global scratch",
         "irfft_rows",
-        "STORE(to + lane, q * INNER(NX) + x, a[q]);\n        }\n        BARRIER;",
-        "STORE(to + lane, q * INNER(NX) + x, a[q]);\n        }",
+        "STORE(FROM_POINT(to, x, lane), q * INNER(NX), a[q]);\n        }\n        BARRIER;",
+        "STORE(FROM_POINT(to, x, lane), q * INNER(NX), a[q]);\n        }",
         "Read-write data race at global memory",
+    ),
+    "no barrier in an exchange": (
+        "group",
+        "convolve_columns",
+        "put(z, n, true, length, radix);\n    BARRIER;",
+        "put(z, n, true, length, radix);",
+        "Read-write data race at local memory",
+    ),
+    "no barrier between exchanges": (
+        "group",
+        "rfft_rows",
+        "take(z, n, false, next_length, next_radix);\n    BARRIER;",
+        "take(z, n, false, next_length, next_radix);",
+        "Read-write data race at local memory",
     ),
     "every group scales the stars": (
         "group, exposure map",
@@ -155,8 +169,8 @@ FAULTS = {
     "padding read": (
         "an item a block",
         "fft_columns",
-        "a[q] = LOAD(from + lane, q * INNER(n) + y)",
-        "a[q] = LOAD(from + lane, q * INNER(n) + y + 1)",
+        "a[q] = LOAD(FROM_POINT(from, y, lane), q * INNER(n))",
+        "a[q] = LOAD(FROM_POINT(from, y, lane), q * INNER(n) + 1)",
         "Uninitialized value written to local memory",
     ),
 }

@@ -23,7 +23,7 @@ READ_WRITE = cl.mem_flags.READ_WRITE
 
 
 def roots(n: int, odd: int, outer: int, last: int) -> NDArray[np.float64]:
-    """Return the roots of unity of a transform of n points, as kernels/fft.cl has them.
+    """Return the roots of unity of a transform of n points, as kernels/scratch.cl has them.
 
     First ``exp(2 pi i k / odd)`` for all k, where `odd` is more than 1. Then the twiddles: a pass
     over subtransforms of length L with radix R has, for j < L / R and 0 < q < R, the root
@@ -39,6 +39,22 @@ def roots(n: int, odd: int, outer: int, last: int) -> NDArray[np.float64]:
     return np.concatenate(tables).astype(np.float64)
 
 
+def roots_in_registers(n: int, odd: int, outer: int, last: int) -> NDArray[np.float64]:
+    """Return the roots of unity of a transform of n points, as kernels/registers.cl has them.
+
+    As `roots` has them, but those of an odd factor in front, by q, and then for each pass of radix
+    `outer` / `odd`, but the last, those of the bits of q alone, by bit.
+    """
+    tables = [_roots(-np.arange(odd), odd)] if odd > 1 else []
+    tables += [_roots(np.arange(n // odd) * q, n) for q in range(1, odd)]
+    length, radix = n // odd, outer // odd
+    while length > last:
+        j, bits = np.arange(length // radix), 1 << np.arange(radix.bit_length() - 1)
+        tables.append(_roots(bits[:, None] * j, length))
+        length //= radix
+    return np.concatenate(tables).astype(np.float64)
+
+
 def _roots(k: NDArray[np.int64], n: int) -> NDArray[np.longdouble]:
     # In long double, where there is one: a rounded angle would cost a digit in double.
     angle = -8.0 * np.arctan(np.longdouble(1.0)) * k / n
@@ -51,8 +67,9 @@ def _all_roots(program: Program) -> dict[str, NDArray[np.float64]]:
     Those of images are left out where their grid is the sky's.
     """
     lengths = (*program.grid[::-1], *program.image_grid[::-1])
+    made = roots_in_registers if program.tuning.points else roots
     tables = {
-        f"{name}_roots": roots(n, *radices)
+        f"{name}_roots": made(n, *radices)
         for (name, radices), n in zip(program.radices.items(), lengths, strict=True)
     }
     return tables if program.oversample > 1 else dict(islice(tables.items(), 2))

@@ -40,16 +40,19 @@ MAX_PROGRAMS = 48
 ROOM = 512 * 2**20
 
 
-def radices(n: int) -> tuple[int, int, int]:
+def radices(n: int, items: int = 0) -> tuple[int, int, int]:
     """Return the odd factor of n points, and the radices of the outer and the last pass.
 
-    Those between are 8.
+    Those between are 8. Where so many items hold a line in registers the outer pass is of all
+    points of one, and those between are of that radix but for the odd factor.
     """
     odd = odd_part(n)
     outer = odd if odd > 1 else 4 if n > 2 and n.bit_length() % 3 == 2 else min(8, n)
-    last = n // outer
-    while last > 8:
-        last //= 8
+    if items:
+        outer = n // items
+    last, radix = n // outer, outer // odd if items else 8
+    while last > radix:
+        last //= radix
     return odd, outer, last
 
 
@@ -122,7 +125,8 @@ class Program:
         self.max_groups = a_unit * device.max_compute_units * self.tuning.scratch_is_global
         lengths = {"row": grid[1], "column": grid[0]}
         lengths |= {"image_row": self.image_grid[1], "image_column": self.image_grid[0]}
-        self.radices = {name: radices(n) for name, n in lengths.items()}
+        items = self.tuning.group // self.tuning.block if self.tuning.points else 0
+        self.radices = {name: radices(n, items) for name, n in lengths.items()}
         constants = {
             "REAL": "double" if dtype == np.float64 else "float",
             "BITS": "long" if dtype == np.float64 else "int",
@@ -135,6 +139,7 @@ class Program:
                 for part, value in zip(("ODD", "OUTER", "LAST"), each, strict=True)
             },
             "CHUNK": self.tuning.chunk,
+            "IN_REGISTERS": int(self.tuning.points > 0),
             "SCRATCH_IS_GLOBAL": int(self.tuning.scratch_is_global),
             "SCRATCH_BLOCKS": self.tuning.scratch_blocks,
             "HAS_BUILTIN_PREFETCH": int(_has_builtin_prefetch(device)),
@@ -191,8 +196,8 @@ class Program:
     @property
     def scratch_bytes(self) -> int:
         """Bytes that a work-group needs for its block."""
-        points = self.tuning.scratch_points(self.grid, self.oversample, self.has_turns)
-        return points * 2 * self.tuning.block * self.dtype.itemsize
+        reals = self.tuning.scratch_reals(self.grid, self.oversample, self.has_turns)
+        return reals * self.dtype.itemsize
 
 
 def _has_builtin_prefetch(device: cl.Device) -> bool:
