@@ -22,8 +22,8 @@
 #define POINTS(n) ((n) / LINE_ITEMS)
 #define RADIX(n) (POINTS(n) / ODD(n))
 #define MAX_POINTS POINTS(NX > NY ? NX : NY)
-#if LINE_ITEMS < 2 || LINE_ITEMS % BLOCK || LINE_ITEMS % OVERSAMPLE
-#error "too few items hold a line"
+#if LINE_ITEMS < 2 || LINE_ITEMS % OVERSAMPLE || RADIX(NX) % (2 * BLOCK)
+#error "lines do not go into registers so"
 #endif
 
 typedef struct {

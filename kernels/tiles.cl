@@ -34,68 +34,81 @@ INLINE size_t tile_start(const int block, const int column_block)
 
 #if IN_REGISTERS
 
-/* An item has POINTS(NX) / 2 points of the tiles of a block, of row pair OWN_PAIR: column OWN_COLUMN and
- * those LINE_ITEMS on and on. So the items of a group read and write side by side.
+/* What an item has of tile t, of those of a block: the columns of one row pair, as many as the pair of
+ * its lane, read and written as they lie. From tile to tile there are LINE_ITEMS others.
  */
-#define OWN_PAIR (ITEM / BLOCK % BLOCK)
-#define OWN_COLUMN (ITEM / (BLOCK * BLOCK) * BLOCK + ITEM % BLOCK)
+typedef union {
+    PASTE(REAL, 4) quads[BLOCK];
+    real parts[4][BLOCK]; /* real and imaginary part of X, and of Y */
+} tile;
 
-/* Where in the exchange point t and its opposite lie, where one point of Z stands for `share`: at the
- * item's own column or its complement, and a constant, but for t = 0.
+#define TILES (POINTS(NX) / (2 * BLOCK))
+#define OWN_TILE (ITEM / BLOCK)
+#define OWN_LANE (ITEM % BLOCK)
+#define QUADS(spectra, block, t)                                    \
+    ((spectra) + tile_start(block, OWN_TILE) + 4 * OWN_LANE * BLOCK \
+        + tile_start(0, (t) * LINE_ITEMS))
+
+/* Where in the exchange column c of tile t and its opposite lie, where one point of Z stands for `share`:
+ * at the columns of the item or their complement, and a constant, but for t = 0.
  */
-INLINE __local real *at_column(const LINES z, const int t, const int share)
+INLINE __local real *at_column(const LINES z, const int t, const int c, const int share)
 {
-    const int h = OWN_COLUMN;
+    const int h = OWN_TILE * BLOCK;
     if (t == 0)
-        return z->exchange + OWN_PAIR + in_exchange(place(h, 0, SHIFT(h)) / share);
-    const int shift = min(HIGH_BIT(t), RADIX(NX) / 2);
-    return z->exchange + OWN_PAIR + in_exchange(h / share)
-        + in_exchange((t + shift) * LINE_ITEMS / share);
+        return z->exchange + OWN_LANE + in_exchange(place(h, c, SHIFT(h)) / share);
+    const int shift = min(HIGH_BIT(t), RADIX(NX) / (2 * BLOCK));
+    return z->exchange + OWN_LANE + in_exchange(h / share)
+        + in_exchange(((t + shift) * GROUP + c) / share);
 }
 
-INLINE __local real *at_opposite(const LINES z, const int t, const int share)
+INLINE __local real *at_opposite(const LINES z, const int t, const int c, const int share)
 {
-    const int h = OWN_COLUMN;
+    const int h = OWN_TILE * BLOCK;
     if (t == 0)
-        return z->exchange + OWN_PAIR + in_exchange(opposite(h, 0, SHIFT(h)) / share);
-    const int shift = min(HIGH_BIT(t), RADIX(NX) / 2);
-    const int opposite_t = ODD(NX) > 1 && shift == RADIX(NX) / 2
-        ? POINTS(NX) + RADIX(NX) - 1 - t - shift
+        return z->exchange + OWN_LANE + in_exchange(opposite(h, c, SHIFT(h)) / share);
+    const int most = RADIX(NX) / (2 * BLOCK), shift = min(HIGH_BIT(t), most);
+    const int opposite_t = ODD(NX) > 1 && shift == most
+        ? (POINTS(NX) + RADIX(NX)) / BLOCK - 1 - t - shift
         : (t + shift) ^ (2 * shift - 1);
-    return z->exchange + OWN_PAIR + in_exchange((LINE_ITEMS - 1 - h) / share)
-        + in_exchange(opposite_t * LINE_ITEMS / share);
+    return z->exchange + OWN_LANE + in_exchange((GROUP - BLOCK - h) / share)
+        + in_exchange((opposite_t * GROUP + BLOCK - 1 - c) / share);
 }
 
-/* Real and imaginary part of X and of Y at point t lie BLOCK apart from here on. */
-#define OF_TILE(spectra, block, t)                                                               \
-    ((spectra) + tile_start(block, ITEM / (BLOCK * BLOCK)) + 4 * OWN_PAIR * BLOCK + ITEM % BLOCK \
-        + tile_start(0, (t) * LINE_ITEMS / BLOCK))
+#define IS_COLUMN_0(t, c) ((t) == 0 && (c) == 0 && OWN_TILE == 0)
 
 /* Half spectra of one block of row pairs -> Z in the lines, in reversed order. */
 INLINE void read_tiles(LINES z, __global const vec *spectra, const int block)
 {
-    vec x[POINTS(NX) / 2][4];
+    tile x[TILES];
     UNROLL
-    for (int t = 0; t < POINTS(NX) / 2; ++t) {
-        __global const vec *from = OF_TILE(spectra, block, t);
+    for (int t = 0; t < TILES; ++t) {
         UNROLL
-        for (int part = 0; part < 4; ++part)
-            x[t][part] = from[part * BLOCK];
+        for (int i = 0; i < BLOCK; ++i)
+            x[t].quads[i] = ((__global const PASTE(REAL, 4) *)QUADS(spectra, block, t))[i];
     }
     UNROLL
-    for (int t = 0; t < POINTS(NX) / 2; ++t) {
-        const bool edges = t == 0 && OWN_COLUMN == 0;
-        *at_column(z, t, 1) = edges ? x[t][1] : x[t][0] - x[t][3];
-        *at_opposite(z, t, 1) = edges ? x[t][0] : x[t][0] + x[t][3];
+    for (int t = 0; t < TILES; ++t) {
+        UNROLL
+        for (int c = 0; c < BLOCK; ++c) {
+            const real re = x[t].parts[0][c], im = x[t].parts[3][c];
+            const bool edges = IS_COLUMN_0(t, c);
+            *at_column(z, t, c, 1) = edges ? x[t].parts[1][c] : re - im;
+            *at_opposite(z, t, c, 1) = edges ? re : re + im;
+        }
     }
     BARRIER;
     take(z, NX, false, LAST(NX), LAST(NX));
     BARRIER;
     UNROLL
-    for (int t = 0; t < POINTS(NX) / 2; ++t) {
-        const bool edges = t == 0 && OWN_COLUMN == 0;
-        *at_column(z, t, 1) = edges ? x[t][3] : x[t][2] + x[t][1];
-        *at_opposite(z, t, 1) = edges ? x[t][2] : x[t][2] - x[t][1];
+    for (int t = 0; t < TILES; ++t) {
+        UNROLL
+        for (int c = 0; c < BLOCK; ++c) {
+            const real re = x[t].parts[2][c], im = x[t].parts[1][c];
+            const bool edges = IS_COLUMN_0(t, c);
+            *at_column(z, t, c, 1) = edges ? x[t].parts[3][c] : re + im;
+            *at_opposite(z, t, c, 1) = edges ? re : re - im;
+        }
     }
     BARRIER;
     take(z, NX, true, LAST(NX), LAST(NX));
@@ -107,28 +120,35 @@ INLINE void read_tiles(LINES z, __global const vec *spectra, const int block)
 INLINE void write_tiles(__global vec *spectra, const LINES z, const int block, const int share)
 {
     const int n = NX / share;
-    vec sums[POINTS(NX) / 2], differences[POINTS(NX) / 2];
+    tile x[TILES];
     put(z, n, false, LAST(n), LAST(n));
     BARRIER;
     UNROLL
-    for (int t = 0; t < POINTS(NX) / 2; ++t) {
-        const bool edges = t == 0 && OWN_COLUMN == 0;
-        const vec one = *at_column(z, t, share), other = *at_opposite(z, t, share);
-        sums[t] = edges ? 2 * other : other + one;
-        differences[t] = edges ? 2 * one : other - one;
+    for (int t = 0; t < TILES; ++t) {
+        UNROLL
+        for (int c = 0; c < BLOCK; ++c) {
+            const real one = *at_column(z, t, c, share), other = *at_opposite(z, t, c, share);
+            x[t].parts[0][c] = IS_COLUMN_0(t, c) ? 2 * other : other + one;
+            x[t].parts[3][c] = IS_COLUMN_0(t, c) ? 2 * one : other - one;
+        }
     }
     BARRIER;
     put(z, n, true, LAST(n), LAST(n));
     BARRIER;
     UNROLL
-    for (int t = 0; t < POINTS(NX) / 2; ++t) {
-        const bool edges = t == 0 && OWN_COLUMN == 0;
-        const vec one = *at_column(z, t, share), other = *at_opposite(z, t, share);
-        __global vec *to = OF_TILE(spectra, block, t);
-        to[0] = sums[t];
-        to[BLOCK] = edges ? differences[t] : one - other;
-        to[2 * BLOCK] = edges ? 2 * other : one + other;
-        to[3 * BLOCK] = edges ? 2 * one : differences[t];
+    for (int t = 0; t < TILES; ++t) {
+        UNROLL
+        for (int c = 0; c < BLOCK; ++c) {
+            const real one = *at_column(z, t, c, share), other = *at_opposite(z, t, c, share);
+            const real im = x[t].parts[3][c];
+            const bool edges = IS_COLUMN_0(t, c);
+            x[t].parts[1][c] = edges ? im : one - other;
+            x[t].parts[2][c] = edges ? 2 * other : one + other;
+            x[t].parts[3][c] = edges ? 2 * one : im;
+        }
+        UNROLL
+        for (int i = 0; i < BLOCK; ++i)
+            ((__global PASTE(REAL, 4) *)QUADS(spectra, block, t))[i] = x[t].quads[i];
     }
     BARRIER;
 }

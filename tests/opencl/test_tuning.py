@@ -96,7 +96,7 @@ def test_blocks_of_a_gpu_lie_in_local_memory(local_kib, grid, dtype, block, grou
         (48, 1024, (2048, 2048), 1, SINGLE, 2, 128),
         (48, 1024, (4096, 4096), 1, SINGLE, 2, 256),
         (48, 256, (4096, 4096), 1, SINGLE, 1, 256),  # where groups have 256 items at most
-        (48, 1024, (768, 768), 1, SINGLE, 4, 64),  # 12 points an item
+        (48, 1024, (768, 768), 1, SINGLE, 2, 64),  # 12 points an item
         (48, 1024, (512, 512), 2, SINGLE, 4, 32),
     ],
 )

@@ -92,9 +92,10 @@ class Tuning:
         most = min(n // odd_part(n) for n in grid) // (2 * oversample)
         lanes = min(self.lanes, most)
         blocks = _powers_of_2_down(min(self.block, most), lanes)
-        if self.points:
+        if self.points:  # of which an item has whole tiles
             items = line_items(grid, oversample, self.points * 4 // dtype.itemsize)
-            groups = {block: items * block for block in blocks if block <= items}
+            fitting = (each for each in blocks if 2 * each * items * odd_part(grid[1]) <= grid[1])
+            groups = {block: items * block for block in fitting if items}
         else:  # no more than a pass has butterflies of radix 8
             butterflies = min(grid) // (8 * oversample)
             groups = {
