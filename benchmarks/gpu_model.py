@@ -3,101 +3,168 @@
     python benchmarks/gpu_model.py
 
 The first tables give, for each length of a square grid and each size of local memory that a device
-reports, columns in a block x work-items in a group, the groups that a compute unit holds at once,
-and the share of its work-items that these are. The last one has times of an iteration of the
-split-gradient method. An iteration moves 10 p + 7 arrays of pixels, for p images; it takes
+reports, columns in a block x work-items in a group, and the points that an item holds in registers.
 
-    bytes / min(bandwidth, DUTY items in flight x BYTES_AN_ITEM / LATENCY) + 5 launches
+The next table has the wavefronts that a transform costs the L1 of a GPU, a point: a warp of 32
+work-items reads or writes 32 banks of local memory at once, or one line of 128 bytes. They are
+counted over the addresses of the passes of kernels/scratch.cl and kernels/registers.cl. Beside them
+is what this makes of a kernel on an H100,
 
-where items in flight are those of all compute units. Arrays that a block of columns holds count as
-moved, though a cache may have them. Bandwidths, compute units and local memory are the vendors'.
+    max(bytes / bandwidth, wavefronts / (units clock)),
+
+and what was measured there with lines in the scratch (results/h100-kernels.ecsv).
 """
 
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
+import pyopencl as cl
+from astropy.table import Table
 
-from lnocl.core.opencl.tuning import Tuning
+from lnocl.core.opencl.program import radices
+from lnocl.core.opencl.tuning import Tuning, candidates
 
+RESULTS = Path(__file__).parent / "results"
 LENGTHS = [64 * 2**k for k in range(8)]
-LOCAL_KIB = 32, 48, 64, 96, 128
-UNITS = 132
-# Most work-items that a compute unit holds.
-MAX_ITEMS = 2048
-# Registers of 32 bits that a unit has, and those of a work-item: tests/system/test_back_ends.py.
-REGISTERS, REGISTERS_OF_ITEM = 65536, {"single": 64, "double": 96}
-# Share of the time in which loads are under way; bytes that an item then waits for; seconds.
-DUTY, BYTES_AN_ITEM, LATENCY = 1 / 3, 64, 600e-9
-LAUNCH = 5e-6
-# Compute units, KiB of local memory that a group may have, KiB of a unit, bytes a second.
-DEVICES = {
-    "NVIDIA H100 SXM": (132, 48, 228, 3.35e12),
-    "AMD MI300X": (304, 64, 64, 5.3e12),
-    "Intel Arc A770": (32, 64, 128, 0.56e12),
-    "Apple M3 Max": (40, 32, 60, 0.4e12),
-    "Intel Iris Xe": (12, 64, 128, 0.068e12),
+LOCAL_KIB = 32, 48, 64
+SINGLE, DOUBLE = np.dtype("f4"), np.dtype("f8")
+# An H100 SXM: compute units, KiB of local memory of a group, cycles and bytes a second.
+UNITS, GROUP_KIB, CLOCK, BANDWIDTH = 132, 48, 1.755e9, 2.95e12
+WARP = 32
+# Images; and of each kernel the arrays of pixels that it moves, where sums over images and the
+# sky's spectrum go through memory, and where not; its transforms, and how often it reads or
+# writes tiles of spectra, and lines.
+P = 4
+KERNELS = {
+    "ratio_rows": (3 * P, 3 * P, 2 * P, 2 * P, P),
+    "correlate_columns": (4 * P - 1, 2 * P + 1, P + 1, 0, 2 * P + 1),
+    "scale_rows": (4, 4, 2, 2, 2),
+    "convolve_columns": (3 * P + 2, 2 * P + 1, P + 1, 0, 2 * P + 1),
 }
-SCENES = {"4 x 1024 x 1024": (4, 1024), "33 x 4096 x 4096": (33, 4096)}
+# Wavefronts a complex point: of tiles, eight loads or stores that each find eight lines for 32
+# items, or two of four numbers; of the real and the imaginary parts of lines, two lines each.
+TILES, QUADS, LINES = 8 * 8 / 64, 0.25, 4 / 32
 
 
-def cut(units, local_kib, n, dtype):
+def device(local_kib):
+    """Return a GPU with so much local memory."""
+    return SimpleNamespace(
+        type=cl.device_type.GPU,
+        local_mem_size=1024 * local_kib,
+        max_compute_units=UNITS,
+        max_work_group_size=1024,
+    )
+
+
+def cut(local_kib, n, dtype):
     """Return the tuning of a grid of n x n."""
-    device = SimpleNamespace(local_mem_size=1024 * local_kib, max_compute_units=units)
-    return Tuning(1, 8, group=256).fit(device, dtype, (n, n))
+    gpu = device(local_kib)
+    return candidates(gpu, dtype)[0].fit(gpu, dtype, (n, n))
 
 
-def groups_of_unit(tuning, unit_kib, n, dtype):
-    """Return how many groups a compute unit holds."""
-    registers = REGISTERS_OF_ITEM["double" if dtype == np.float64 else "single"]
-    most = min(MAX_ITEMS, REGISTERS // registers) // tuning.group
-    if tuning.scratch_is_global:
-        return min(4, most)
-    return min(most, 1024 * unit_kib // tuning.local_bytes((n, n), 1, dtype))
-
-
-def tables():
+def cuts():
     """Yield the lines of a table for each precision."""
-    for name, dtype in (("single", np.dtype("f4")), ("double", np.dtype("f8"))):
+    for name, dtype in (("single", SINGLE), ("double", DOUBLE)):
         yield f"\n{name} precision, {UNITS} compute units\n"
         yield "| Length | " + " | ".join(f"{kib} KiB" for kib in LOCAL_KIB) + " |"
         yield "| --- " * (1 + len(LOCAL_KIB)) + "|"
         for n in LENGTHS:
             cells = []
             for kib in LOCAL_KIB:
-                tuning = cut(UNITS, kib, n, dtype)
-                groups = groups_of_unit(tuning, kib, n, dtype)
-                share = groups * tuning.group / MAX_ITEMS
-                where = " global" if tuning.scratch_is_global else ""
-                cells.append(f"{tuning.block} x {tuning.group}{where}, {groups}, {share:.0%}")
+                own = cut(kib, n, dtype)
+                held = f"{n * own.block // own.group} points" if own.points else "scratch"
+                where = "global " if own.scratch_is_global else ""
+                cells.append(f"{own.block} x {own.group}, {where}{held}")
             yield f"| {n} | " + " | ".join(cells) + " |"
 
 
-def milliseconds(device, p, n):
-    """Return the cut, the share of items in flight, and the milliseconds of an iteration."""
-    units, group_kib, unit_kib, bandwidth = device
-    dtype = np.dtype("f4")
-    tuning = cut(units, group_kib, n, dtype)
-    launched = n // (2 * tuning.block)  # blocks of columns, the fewest of all kernels
-    groups = min(groups_of_unit(tuning, unit_kib, n, dtype), launched / units)
-    items = units * groups * tuning.group
-    wasted = max(1.0, 32 / (4 * tuning.block**2 * dtype.itemsize))
-    n_bytes = (10 * p + 7) * n * n * dtype.itemsize * wasted
-    rate = min(bandwidth, DUTY * items * BYTES_AN_ITEM / LATENCY)
-    return tuning, groups * tuning.group / MAX_ITEMS, 1e3 * (n_bytes / rate + 5 * LAUNCH)
+def wavefronts(instructions, is_local):
+    """Return those of loads or stores, each with the words that the items of a group have."""
+    total = 0
+    for words in instructions:
+        for warp in np.split(words, range(WARP, len(words), WARP)):
+            own = np.unique(warp)
+            total += np.bincount(own % WARP).max() if is_local else len(np.unique(own // WARP))
+    return total
 
 
-def times():
-    """Yield the lines of the table of devices."""
-    yield "\n| Device | " + " | ".join(SCENES) + " |"
-    yield "| --- " * (1 + len(SCENES)) + "|"
-    for name, device in DEVICES.items():
-        cells = []
-        for p, n in SCENES.values():
-            tuning, share, ms = milliseconds(device, p, n)
-            where = " global" if tuning.scratch_is_global else ""
-            cells.append(f"{tuning.block} x {tuning.group}{where}, {share:.0%}, {ms:.3g} ms")
-        yield f"| {name} | " + " | ".join(cells) + " |"
+def in_scratch(n, block):
+    """Return the wavefronts of a transform of a block, in local memory and for the roots."""
+    _, outer, last = radices(n)
+    length, radix, local, roots = n, outer, 0, 0
+    while length > 1:
+        width, piece = length // radix, np.arange(n // radix * block)
+        b, lane = piece // block, piece % block
+        at = b // width * length + b % width
+        legs = [(2 * (at + q * width) + i) * block + lane for q in range(radix) for i in (0, 1)]
+        local += wavefronts(legs, True) * (1 if length == n else 2)
+        if width > 1:
+            j = b % width
+            table = [2 * ((radix - 1) * j + q) + i for q in range(radix - 1) for i in (0, 1)]
+            roots += wavefronts(table, False)
+        length, radix = width, 8 if width // 8 >= last else last
+    return local, roots
+
+
+def in_registers(n, own):
+    """Return the same with lines in registers, for an even number of points."""
+    items = own.group // own.block
+    points = n // items
+    _, _, last = radices(n, items)
+    item = np.arange(own.group)
+    j, lane = item // own.block, item % own.block
+    lengths = [n]
+    while lengths[-1] > last:
+        lengths.append(lengths[-1] // points)
+    local = roots = 0
+    for k, length in enumerate(lengths):
+        radix = min(points, length)
+        width = length // radix
+        b = [j * (points // radix) + i // radix for i in range(points)]
+        at = [each // width * length + each % width + i % radix * width for i, each in enumerate(b)]
+        times = 2 * (1 if k in (0, len(lengths) - 1) else 2)
+        local += times * wavefronts([(x + x // 16) * own.block + lane for x in at], True)
+        bits = [1 << bit for bit in range(radix.bit_length() - 1)] if width > 1 else []
+        roots += wavefronts(
+            [2 * (k * width + j % width) + i for k in range(len(bits)) for i in (0, 1)], False
+        )
+    return local, roots
+
+
+def microseconds(kernel, n, waves, held):
+    """Return those of a kernel, of which a transform costs so many wavefronts a point."""
+    in_memory, in_hand, transforms, tiles, lines = KERNELS[kernel]
+    n_bytes = (in_hand if held else in_memory) * n * n * SINGLE.itemsize
+    a_point = transforms * waves + tiles * (QUADS if held else TILES) + lines * LINES
+    return 1e6 * max(n_bytes / BANDWIDTH, a_point * n * n / 2 / (UNITS * CLOCK))
+
+
+def kernels():
+    """Yield the lines of the table of wavefronts and times."""
+    measured = Table.read(RESULTS / "h100-kernels.ecsv")
+    yield "\n| Length | Lines | Local memory | Roots | " + " | ".join(KERNELS) + " |"
+    yield "| --- " * (4 + len(KERNELS)) + "|"
+    for n in (256, 1024, 2048, 4096):
+        gpu = device(GROUP_KIB)
+        old = Tuning(1, 8, group=256).fit(gpu, SINGLE, (n, n))
+        new = cut(GROUP_KIB, n, SINGLE)
+        sides = {
+            "scratch": (in_scratch(n, old.block), old.block, False),
+            "registers": (in_registers(n, new), new.block, True),
+        }
+        row = measured[(measured["size"] == n) & (measured["cut"] == "lnocl")][0]
+        for side, (counts, block, held) in sides.items():
+            local, roots = (count / (n * block) for count in counts)
+            times = [microseconds(kernel, n, local + roots, held) for kernel in KERNELS]
+            if not held:
+                times = [
+                    f"{t:.0f} ({row[each]:.0f})" for t, each in zip(times, KERNELS, strict=True)
+                ]
+            else:
+                times = [f"{t:.0f}" for t in times]
+            yield f"| {n} | {side} | {local:.2f} | {roots:.2f} | " + " | ".join(times) + " |"
 
 
 if __name__ == "__main__":
-    print("\n".join([*tables(), *times()]))
+    print("\n".join([*cuts(), *kernels()]))
