@@ -73,7 +73,7 @@ CASES = {
     "turned, GPU": ((512, 64), of_gpu(512, 64, has_turns=True), TURNED, "S"),
     "global scratch": ((64, 32), Tuning(4, 16, scratch_is_global=True), "plain", "S"),
     "several vectors a block": ((64, 32), Tuning(4, 8), "mask, mu, smoothing", "S"),
-    "group": ((64, 32), Tuning(1, 8, group=4), THREE_IMAGES, "sD"),
+    "group": ((64, 32), Tuning(1, 8, group=4), THREE_IMAGES, "SD"),
     "group, middle pass": ((2048, 16), Tuning(1, 2, group=64), "plain", "D"),
     "group, global scratch": (
         (256, 64),
