@@ -83,8 +83,11 @@ typedef PASTE(BITS, WIDTH) ivec;
 #define UNROLL_IN_GROUPS
 #endif
 #define KERNEL __kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
-/* That it is less than GROUP, a power of two, compilers need to be told. */
+#if IN_REGISTERS /* that it is less than GROUP, a power of two, makes addresses constants there */
 #define ITEM ((int)get_local_id(0) & (GROUP - 1))
+#else
+#define ITEM ((int)get_local_id(0))
+#endif
 #if GROUP > 1
 #define BARRIER barrier(CLK_LOCAL_MEM_FENCE | CLK_GLOBAL_MEM_FENCE)
 #else
