@@ -1,5 +1,5 @@
 /* An FFT of n = ODD(n) EVEN(n) points, ODD(n) 1, 3, 5, 7 or 9 and EVEN(n) a power of two: one odd
- * pass (odd.cl), and radix-2 butterflies, up to three deep in registers.
+ * pass (odd.cl), and radix-2 butterflies, up to four deep in registers.
  *
  * Forward: decimation in frequency, natural order in, reversed order out, exp(-2 pi i ...).
  * Inverse: decimation in time, reversed order in, natural order out, exp(+2 pi i ...), not
@@ -14,12 +14,12 @@
  *   FOR_EACH_POINT(i, n)   i: a point of lines of n points that this work-item has
  *   POINT(z, i), SET_POINT(z, i, value)   that point
  *   LANE_OF(i)             its column, or pair of rows, of the block
- *   OWN_LINE(p, i), ALONG(i)   of pixels from p on: where its line begins, or what of it this work-item has, and
- *                          which point from there it is; OWN_MAP the same of a map, or of one point
+ *   OWN_LINE(p, i), ALONG(i)   where its line begins, or this work-item's points of it, in pixels from p
+ *                          on, and which point from there it is; OWN_MAP: of a map, or of one point
  *   PLACE_OF(i, n)         and its place in reversed order, of a spectrum
- *   FOR_EACH_IN_WINDOW(i, corner, n_columns, n)   the same for those in some columns of a window from
- *                          column `corner` on, round the end; COLUMN_OF(i, corner, n), IN_LINES(i, corner, n):
- *                          the column of the window, and i of the point
+ *   FOR_EACH_IN_WINDOW(i, corner, n_columns, n)   those in a window, from column `corner` of the line on,
+ *                          round its end
+ *   COLUMN_OF(i, corner, n), IN_LINES(i, corner, n)   the window's column, and i of the point
  */
 
 #define IS_ROW(n) ((n) == NX || (n) == IMAGE_NX)

@@ -139,8 +139,8 @@ enum {
  */
 #define OF_MEMBER(p, size) ((p) += get_group_id(1) * (size))
 
-/* Shares n blocks among however many work-groups were launched: as many as there are blocks where lines lie in
- * registers, as addresses that hold for every round of a loop would stay in more of them.
+/* Shares n blocks among however many work-groups were launched. Where lines lie in registers these are
+ * n: addresses that hold for every round of a loop would take registers too.
  */
 #if IN_REGISTERS
 #define FOR_EACH_BLOCK(block, n) \

@@ -5,8 +5,9 @@ INLINE vec not_below_0(const vec x)
     return x < 0 ? (vec)0 : x;
 }
 
-/* Scales the points of a butterfly, 0, INNER(NX), ... from the pointers on, whose corrections c a[] has, in place;
- * their sum of f^2. It is called with a literal is_smoothed, and mu 0: branches in the loop would leave a[] in memory.
+/* Scales the points of a butterfly, 0, INNER(NX), ... from the pointers on, whose corrections c a[] has,
+ * in place; their sum of f^2. It is called with a literal is_smoothed, and mu 0: branches in the loop
+ * would leave a[] in memory.
  */
 INLINE vec scale_points(
     cvec *a, __global vec *extended, __global const vec *inverse_weight, __global const vec *slope,

@@ -13,7 +13,7 @@
 
 #if !IN_REGISTERS
 
-#define MAX_OUTER MAX_ODD /* more than 8, the most where there is no odd pass */
+#define MAX_OUTER MAX_ODD /* the odd pass has the largest radix */
 #define HAS_MIDDLE(n) (INNER(n) > LAST(n) && INNER(n) > CHUNK)
 #define SPAN_LENGTH(n) (HAS_MIDDLE(n) ? INNER(n) / 8 : INNER(n))
 #define SPAN(n) (GROUP > 1 ? (n) : SPAN_LENGTH(n))
@@ -40,7 +40,7 @@ INLINE int in_line(const int pixel, const int n)
     return pixel < n ? pixel : pixel - n;
 }
 
-/* Points of a sky that are one of an image's, and that of an image for one of the sky, in reversed order. */
+/* In reversed order point q of a sky of those that are one of an image, and the image's for one of a sky. */
 #define POINT_OF_SKY(z, i, q) LOAD((z) + (i) % SIDE, (i) / SIDE * OVERSAMPLE + (q))
 #define POINT_OF_IMAGE(z, i) LOAD((z) + (i) % SIDE, (i) / SIDE / OVERSAMPLE)
 /* The point of an OTF at a place, for point q of `share` that are point i of a line. */

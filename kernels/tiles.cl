@@ -77,6 +77,25 @@ INLINE __local real *at_opposite(const LINES z, const int t, const int c, const 
 
 #define IS_COLUMN_0(t, c) ((t) == 0 && (c) == 0 && OWN_TILE == 0)
 
+/* Puts one part of Z into the exchange, x_first + sign x_second at the columns and x_first - sign x_second
+ * at their opposites; of column 0 x_edge and x_first.
+ */
+INLINE void put_tiles(
+    const LINES z, const tile *x, const int first, const int second, const real sign,
+    const int edge)
+{
+    UNROLL
+    for (int t = 0; t < TILES; ++t) {
+        UNROLL
+        for (int c = 0; c < BLOCK; ++c) {
+            const real one = x[t].parts[first][c], other = sign * x[t].parts[second][c];
+            const bool edges = IS_COLUMN_0(t, c);
+            *at_column(z, t, c, 1) = edges ? x[t].parts[edge][c] : one + other;
+            *at_opposite(z, t, c, 1) = edges ? one : one - other;
+        }
+    }
+}
+
 /* Half spectra of one block of row pairs -> Z in the lines, in reversed order. */
 INLINE void read_tiles(LINES z, __global const vec *spectra, const int block)
 {
@@ -87,29 +106,11 @@ INLINE void read_tiles(LINES z, __global const vec *spectra, const int block)
         for (int i = 0; i < BLOCK; ++i)
             x[t].quads[i] = ((__global const PASTE(REAL, 4) *)QUADS(spectra, block, t))[i];
     }
-    UNROLL
-    for (int t = 0; t < TILES; ++t) {
-        UNROLL
-        for (int c = 0; c < BLOCK; ++c) {
-            const real re = x[t].parts[0][c], im = x[t].parts[3][c];
-            const bool edges = IS_COLUMN_0(t, c);
-            *at_column(z, t, c, 1) = edges ? x[t].parts[1][c] : re - im;
-            *at_opposite(z, t, c, 1) = edges ? re : re + im;
-        }
-    }
+    put_tiles(z, x, 0, 3, -1, 1);
     BARRIER;
     take(z, NX, false, LAST(NX), LAST(NX));
     BARRIER;
-    UNROLL
-    for (int t = 0; t < TILES; ++t) {
-        UNROLL
-        for (int c = 0; c < BLOCK; ++c) {
-            const real re = x[t].parts[2][c], im = x[t].parts[1][c];
-            const bool edges = IS_COLUMN_0(t, c);
-            *at_column(z, t, c, 1) = edges ? x[t].parts[3][c] : re + im;
-            *at_opposite(z, t, c, 1) = edges ? re : re - im;
-        }
-    }
+    put_tiles(z, x, 2, 1, 1, 3);
     BARRIER;
     take(z, NX, true, LAST(NX), LAST(NX));
 }

@@ -157,6 +157,7 @@ def test_the_default_is_the_first_candidate():
         *(f"{n} points a work-item in registers at most" for n in (16, 8)),
         *(f"work-groups of {n} and blocks of {block}" for block in (8, 2) for n in (256, 128, 64)),
     ]
+    assert in_words(candidates(GPU, DOUBLE)[0], DOUBLE).startswith("8 points")
 
 
 @pytest.mark.parametrize("given", [CPU, GPU], ids=["CPU", "GPU"])

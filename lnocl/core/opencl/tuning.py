@@ -19,8 +19,8 @@ from lnocl.errors import FileError
 
 # Bytes that a device reads or writes at once.
 SECTOR = 32
-# Work-items of a group of a GPU, by default.
-GROUP = 256
+# Work-items of a group of a GPU, by default, and the most: more leave each too few registers.
+GROUP, MAX_GROUP = 256, 512
 # Points of a line that a work-item of a GPU holds in registers at most, in single precision.
 MAX_POINTS = 16
 
@@ -183,8 +183,8 @@ def candidates(device: cl.Device, dtype: np.dtype) -> list[Tuning]:
     if device.type & cl.device_type.CPU:
         lanes = (n_bytes // dtype.itemsize for n_bytes in (32, 64))
         return [Tuning(n, n, scratch_blocks=2) for n in lanes]
-    most = _power_of_2_up_to(device.max_work_group_size)
-    groups = dict.fromkeys(min(n, most) for n in (GROUP, 512, 128, 64))
+    most = min(MAX_GROUP, _power_of_2_up_to(device.max_work_group_size))
+    groups = dict.fromkeys(min(n, most) for n in (GROUP, MAX_GROUP, 128, 64))
     in_registers = (Tuning(1, 8, most, points=n) for n in (MAX_POINTS, MAX_POINTS // 2))
     return [*in_registers, *(Tuning(1, block, group) for block in (8, 2) for group in groups)]
 
@@ -228,7 +228,7 @@ def _file(device: cl.Device) -> Path:
 def in_words(tuning: Tuning, dtype: np.dtype) -> str:
     """Return the width of the vectors, the size of the work-groups or their points in words."""
     if tuning.points:
-        return f"{tuning.points} points a work-item in registers at most"
+        return f"{tuning.points * 4 // dtype.itemsize} points a work-item in registers at most"
     if tuning.group > 1 or tuning.lanes == 1:
         return f"work-groups of {tuning.group} and blocks of {tuning.block}"
     return f"vectors of {8 * dtype.itemsize * tuning.lanes} bits"
