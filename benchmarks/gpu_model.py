@@ -13,6 +13,8 @@ is what this makes of a kernel on an H100,
     max(bytes / bandwidth, wavefronts / (units clock)),
 
 and what was measured there with lines in the scratch (results/h100-kernels.ecsv).
+
+The last table has an iteration, which is the four kernels, of images whose lines are in registers.
 """
 
 from pathlib import Path
@@ -79,12 +81,12 @@ def cuts():
             yield f"| {n} | " + " | ".join(cells) + " |"
 
 
-def wavefronts(instructions, is_local):
-    """Return those of loads or stores, each with the words that the items of a group have."""
+def wavefronts(instructions, is_local, size=1):
+    """Return those of loads or stores, each of the places of the items' numbers of `size` words."""
     total = 0
-    for words in instructions:
-        for warp in np.split(words, range(WARP, len(words), WARP)):
-            own = np.unique(warp)
+    for places in instructions:
+        for some in np.split(places, range(WARP // size, len(places), WARP // size)):
+            own = np.unique(np.add.outer(size * some, np.arange(size)))
             total += np.bincount(own % WARP).max() if is_local else len(np.unique(own // WARP))
     return total
 
@@ -107,8 +109,9 @@ def in_scratch(n, block):
     return local, roots
 
 
-def in_registers(n, own):
+def in_registers(n, own, dtype):
     """Return the same with lines in registers, for an even number of points."""
+    size = dtype.itemsize // SINGLE.itemsize
     items = own.group // own.block
     points = n // items
     _, _, last = radices(n, items)
@@ -124,19 +127,20 @@ def in_registers(n, own):
         b = [j * (points // radix) + i // radix for i in range(points)]
         at = [each // width * length + each % width + i % radix * width for i, each in enumerate(b)]
         times = 2 * (1 if k in (0, len(lengths) - 1) else 2)
-        local += times * wavefronts([(x + x // 16) * own.block + lane for x in at], True)
+        local += times * wavefronts([(x + x // 16) * own.block + lane for x in at], True, size)
         bits = [1 << bit for bit in range(radix.bit_length() - 1)] if width > 1 else []
         roots += wavefronts(
-            [2 * (k * width + j % width) + i for k in range(len(bits)) for i in (0, 1)], False
+            [2 * (k * width + j % width) + i for k in range(len(bits)) for i in (0, 1)], False, size
         )
     return local, roots
 
 
-def microseconds(kernel, n, waves, held):
+def microseconds(kernel, n, waves, held, dtype=SINGLE):
     """Return those of a kernel, of which a transform costs so many wavefronts a point."""
     in_memory, in_hand, transforms, tiles, lines = KERNELS[kernel]
-    n_bytes = (in_hand if held else in_memory) * n * n * SINGLE.itemsize
-    a_point = transforms * waves + tiles * (QUADS if held else TILES) + lines * LINES
+    n_bytes = (in_hand if held else in_memory) * n * n * dtype.itemsize
+    moved = tiles * (QUADS if held else TILES) + lines * LINES
+    a_point = transforms * waves + moved * dtype.itemsize / SINGLE.itemsize
     return 1e6 * max(n_bytes / BANDWIDTH, a_point * n * n / 2 / (UNITS * CLOCK))
 
 
@@ -151,7 +155,7 @@ def kernels():
         new = cut(GROUP_KIB, n, SINGLE)
         sides = {
             "scratch": (in_scratch(n, old.block), old.block, False),
-            "registers": (in_registers(n, new), new.block, True),
+            "registers": (in_registers(n, new, SINGLE), new.block, True),
         }
         row = measured[(measured["size"] == n) & (measured["cut"] == "lnocl")][0]
         for side, (counts, block, held) in sides.items():
@@ -166,5 +170,22 @@ def kernels():
             yield f"| {n} | {side} | {local:.2f} | {roots:.2f} | " + " | ".join(times) + " |"
 
 
+def iterations():
+    """Yield the lines of the table of iterations."""
+    yield "\n| Images | Precision | Iteration (us) |"
+    yield "| --- | --- | --- |"
+    for skies, n, name, dtype in (
+        (1000, 64, "single", SINGLE),
+        (1, 1024, "single", SINGLE),
+        (1, 1024, "double", DOUBLE),
+        (1, 2048, "single", SINGLE),
+        (1, 4096, "single", SINGLE),
+    ):
+        own = cut(GROUP_KIB, n, dtype)
+        waves = sum(in_registers(n, own, dtype)) / (n * own.block)
+        time = skies * sum(microseconds(kernel, n, waves, True, dtype) for kernel in KERNELS)
+        yield f"| {skies} x {P} x {n} x {n} | {name} | {time:.0f} |"
+
+
 if __name__ == "__main__":
-    print("\n".join([*cuts(), *kernels()]))
+    print("\n".join([*cuts(), *kernels(), *iterations()]))
