@@ -27,7 +27,7 @@ from lnocl.core.runs.progress import Progress
 from lnocl.core.scene.observation import Observation
 from lnocl.core.scene.psf_families import Family
 from lnocl.core.solvers import SolverName
-from lnocl.errors import note
+from lnocl.errors import detail
 from lnocl.reconstruction import reconstruct
 from lnocl.residuals import judge_stars
 from lnocl.result import Callback, Result, make_result
@@ -417,7 +417,7 @@ def _finish(outcome: Outcome, plan: Plan, prepared: Prepared, progress: bool) ->
         with quietly(), Progress(None, "", bool(progress), what, stays=False):
             outcome = outcome.marginal(is_within, has_halos, has_levels)
     for words in outcome.levels_in_words():
-        note("%s", words)
+        detail("%s", words)
     return replace(
         outcome,
         psf_refinement=prepared.refinement,

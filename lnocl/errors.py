@@ -240,6 +240,15 @@ def warn(message: str, category: type[LnoclWarning] = LnoclWarning) -> None:
 
 
 def note(message: str, *values: Any) -> None:
-    """Log what was found or done, at the level of information; `values` are as for %."""
+    """Log what was changed in the data or the model, as information; `values` are as for %."""
+    _log(logging.INFO, message, values)
+
+
+def detail(message: str, *values: Any) -> None:
+    """Log what was measured or chosen, for debugging; `values` are as for %."""
+    _log(logging.DEBUG, message, values)
+
+
+def _log(level: int, message: str, values: tuple[Any, ...]) -> None:
     whole = message % values if values else message
-    LOG.info("%s", with_names(whole), extra={"named": whole})
+    LOG.log(level, "%s", with_names(whole), extra={"named": whole})

@@ -47,5 +47,5 @@ def frame_folder(tmp_path, monkeypatch):
 
 @pytest.fixture
 def log(caplog):
-    caplog.set_level(logging.INFO, "lnocl")
+    caplog.set_level(logging.DEBUG, "lnocl")
     return caplog

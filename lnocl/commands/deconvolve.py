@@ -5,16 +5,17 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import os
+import re
 from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from lnocl.commands import checkpoints, messages, options, pictures, record
 from lnocl.commands.deconvolve_options import ALL_OPTIONS, OPTIONS, PARAMETERS
 from lnocl.commands.parser import Command
-from lnocl.commands.summary import summarise
 from lnocl.core.runs.progress import Progress
 from lnocl.deconvolution import deconvolve
-from lnocl.errors import InputError, warn
+from lnocl.errors import InputError, MisfitWarning, detail, warn
 from lnocl.result import Callback, Result, view_of
 
 if TYPE_CHECKING:
@@ -96,7 +97,7 @@ def _run(arguments: argparse.Namespace) -> Iterator[str]:
     checkpoints.check(arguments)
     check_parallel(arguments.parallel)
     with (
-        messages.recorded_warnings(COMMAND.flags()) as warned,
+        messages.recorded(COMMAND.flags(), partial(_is_shown, arguments)) as recorded,
         checkpoints.Interrupts() as interrupts,
     ):
         frames, given = read(arguments)
@@ -104,16 +105,36 @@ def _run(arguments: argparse.Namespace) -> Iterator[str]:
         interrupts.listen()  # a run that was resumed at its end has no iteration to start from
         if result.stop_reason == "callback":
             result = dataclasses.replace(result, stop_reason="interrupt")
-        with Progress(None, "", not arguments.quiet, "measuring errors", stays=False):
-            lines = summarise(arguments, result, frames, bool(warned))
-        _write(arguments, result, frames, given, [*warned, *lines])
-        lines.append(f"written to {arguments.output}")
+        lines = _answer(arguments, result, frames, recorded)
+        _write(arguments, result, frames, given, [*lines, "", *recorded])
         if arguments.plot is not None:
             from lnocl.plotting.result import draw_result
 
-            lines.append(pictures.draw(arguments, draw_result(view_of(result))))
-        yield from lines
+            pictures.draw(arguments, draw_result(view_of(result)))
+        *lines, end = lines
+        files = [each for each in (arguments.output, arguments.plot) if each is not None]
+        yield from [*lines, f"{end}; {', '.join(files)}"]
     interrupts.explain(arguments, result)
+
+
+def _is_shown(arguments: argparse.Namespace, warning: Warning) -> bool:
+    """Return whether a warning is shown: that the model does not fit is in the answer."""
+    return arguments.quiet or not isinstance(warning, MisfitWarning)
+
+
+def _answer(
+    arguments: argparse.Namespace, result: Result, frames: Frames, recorded: Sequence[str]
+) -> list[str]:
+    """Return what is said of a result, after what was recorded; log the details."""
+    from lnocl.result.summary import Unit, details, summary_lines
+
+    with Progress(None, "", not arguments.quiet, "measuring errors", stays=False):
+        for line in details(result):
+            detail("%s", line)
+        name = re.sub(r"^(electron|photon)\b", r"\1s", frames.unit)
+        is_warned = any(line.startswith("warning: ") for line in recorded)
+        lines = summary_lines(result, Unit(name, frames.electrons), is_warned)
+        return [messages.in_shell(each, COMMAND.flags()) for each in lines]
 
 
 def _write(

@@ -54,6 +54,7 @@ OPTIONS = {
             "and of how the iteration was chosen"
         ),
         options.QUIET,
+        options.VERBOSE,
     ],
     "calibration": [
         BACKGROUND.but(

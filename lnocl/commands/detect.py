@@ -34,6 +34,7 @@ OPTIONS = [
     options.PICTURE.but(help="picture of the map with the detections and their numbers"),
     options.OVERWRITE.but(help="replace TABLE and FILE.png if they exist"),
     options.QUIET,
+    options.VERBOSE,
 ]
 
 

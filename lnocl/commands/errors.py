@@ -54,6 +54,7 @@ OPTIONS = [
     options.parallel("replicas"),
     options.OVERWRITE.but(help="begin anew, without the replicas that RESULT.fits has"),
     options.QUIET,
+    options.VERBOSE,
 ]
 
 

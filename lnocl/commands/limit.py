@@ -46,6 +46,7 @@ OPTIONS = [
     options.PICTURE.but(help="picture of the map of the limits and of their curves"),
     options.OVERWRITE.but(help="replace TABLE and FILE.png if they exist"),
     options.QUIET,
+    options.VERBOSE,
 ]
 
 

@@ -8,10 +8,11 @@ import os
 import re
 import sys
 import warnings
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any, TextIO
 
-from lnocl.errors import LnoclWarning, with_names
+from lnocl.core.runs.progress import LOG as PROGRESS
+from lnocl.errors import LOG, LnoclWarning, with_names
 
 # Rows of a table that are printed, unless more were asked for.
 MAX_LISTED = 12
@@ -80,41 +81,81 @@ def _message_of(warning: Warning | str) -> str:
 
 
 @contextlib.contextmanager
-def recorded_warnings(flags: Mapping[str, str]) -> Iterator[list[str]]:
-    """Yield a list to which each warning that is shown is added, as it is meant in a shell."""
+def recorded(flags: Mapping[str, str], shows: Callable[[Warning], bool]) -> Iterator[list[str]]:
+    """Yield a list of each note, detail and warning, as in a shell; show the warnings that match.
+
+    Parameters
+    ----------
+    flags : mapping of str to str
+        As for `in_shell`.
+    shows : callable
+        Given a warning, returns whether it is shown too.
+    """
     lines: list[str] = []
     show = warnings.showwarning
 
     def record(message: Warning | str, *where: Any, **more: Any) -> None:
         lines.append(f"warning: {in_shell(_message_of(message), flags)}")
-        show(message, *where, **more)
+        if isinstance(message, str) or shows(message):
+            show(message, *where, **more)
 
     warnings.showwarning = record
     try:
-        yield lines
+        with _handled(LOG, _Notes(flags, lines.append, logging.DEBUG)):
+            yield lines
     finally:
         warnings.showwarning = show
 
 
 @contextlib.contextmanager
-def shown_log(quiet: bool, flags: Mapping[str, str]) -> Iterator[None]:
-    """Show the notes that the library logs on stderr, with `in_shell`, unless it is quiet.
+def shown_log(level: int, flags: Mapping[str, str]) -> Iterator[None]:
+    """Show the notes that the library logs on stderr, with `in_shell`.
 
-    Inside that of another command it takes its place.
+    At the level of information they come at the end, below the answer; that of debugging shows
+    details too, and each at once. Inside that of another command it takes its place.
+
+    Parameters
+    ----------
+    level : int
+        ``logging.INFO`` or ``logging.DEBUG``; ``logging.CRITICAL`` shows no notes.
+    flags : mapping of str to str
+        As for `in_shell`.
     """
-    log = logging.getLogger("lnocl")
-    handlers, levels = log.handlers, {each: each.level for each in (log, log.getChild("progress"))}
-    log.handlers = [each for each in handlers if not isinstance(each, _Notes)]
-    if not quiet:
-        log.addHandler(_Notes(flags))
-        for each in levels:
-            each.setLevel(logging.INFO)
+    held: list[str] = []
+    show = held.append if level > logging.DEBUG else _note
+    try:
+        with (
+            _handled(LOG, _Notes(flags, show, level), takes_place=True),
+            _handled(PROGRESS, _Notes(flags, _note, level), takes_place=True),
+        ):
+            yield
+    finally:
+        for each in _without_likes(held):
+            _note(each)
+
+
+@contextlib.contextmanager
+def _handled(log: logging.Logger, handler: _Notes, takes_place: bool = False) -> Iterator[None]:
+    """Give a logger a handler, and its level, beside or in place of those of other commands."""
+    level, handlers = log.level, log.handlers
+    others = [each for each in handlers if not (takes_place and isinstance(each, _Notes))]
+    handler.addFilter(lambda record: record.name == log.name)
+    log.handlers = [*others, handler]
+    log.setLevel(min(handler.level, level or handler.level))
     try:
         yield
     finally:
         log.handlers = handlers
-        for each, level in levels.items():
-            each.setLevel(level)
+        log.setLevel(level)
+
+
+def _without_likes(lines: Sequence[str]) -> Iterator[str]:
+    """Yield lines, of those that differ in numbers alone the first, with how many follow."""
+    groups: dict[str, list[str]] = {}
+    for line in lines:
+        groups.setdefault(re.sub(r"[-+]?\d[\d.e+-]*", "0", line), []).append(line)
+    for first, *others in groups.values():
+        yield f"{first}; {len(others)} more like this: --verbose" if others else first
 
 
 def _note(message: str) -> None:
@@ -126,23 +167,25 @@ def _note(message: str) -> None:
 
 
 class _Notes(logging.Handler):
-    """Handler that shows each note once, where several runs log the same."""
+    """Handler that passes on each note of its logger once, where several runs log the same."""
 
-    def __init__(self, flags: Mapping[str, str]) -> None:
-        super().__init__()
-        self._flags = flags
-        self._shown: set[str] = set()
+    def __init__(self, flags: Mapping[str, str], show: Callable[[str], None], level: int) -> None:
+        super().__init__(level)
+        self._flags, self._show = flags, show
+        self._seen: set[str] = set()
 
     def emit(self, record: logging.LogRecord) -> None:
-        message = in_shell(getattr(record, "named", record.getMessage()), self._flags)
-        if message not in self._shown:
-            self._shown.add(message)
-            _note(message)
+        named = getattr(record, "named", None)
+        message = record.getMessage() if named is None else in_shell(named, self._flags)
+        if message not in self._seen:
+            self._seen.add(message)
+            self._show(message)
 
 
 def _one_line(text: str, stream: TextIO) -> str:
     """Return text in one line, with escapes for characters that a terminal cannot show."""
     joined = " ".join(part.strip() for part in text.splitlines())
+    joined = " " * (len(text) - len(text.lstrip(" "))) + joined
     shown = "".join(c if c.isprintable() else _escape(c) for c in joined)
     encoding = stream.encoding or "ascii"
     return shown.encode(encoding, "backslashreplace").decode(encoding)

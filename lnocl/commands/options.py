@@ -352,7 +352,12 @@ OVERWRITE = option(
 QUIET = option(
     "--quiet", action="store_true", is_repeated=False, help="show only warnings and errors"
 )
-
+VERBOSE = option(
+    "--verbose",
+    action="store_true",
+    is_repeated=False,
+    help="show what was measured and chosen too, as it happens",
+)
 
 PICTURE = option("--plot", metavar="FILE.png", is_repeated=False)
 

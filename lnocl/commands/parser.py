@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import logging
 import os
 import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -39,9 +40,12 @@ class Command(NamedTuple):
 
         One that cannot be told to be quiet shows no notes.
         """
-        with shown_log(getattr(arguments, "quiet", True), self.flags()):
+        level = logging.DEBUG if _is(arguments, "verbose") else logging.INFO
+        if not hasattr(arguments, "quiet") or arguments.quiet:
+            level = logging.CRITICAL
+        with shown_log(level, self.flags()):
             for line in self.run(arguments):
-                if not getattr(arguments, "quiet", False):
+                if not _is(arguments, "quiet"):
                     yield line
 
     def add_arguments(self, parser: argparse.ArgumentParser) -> None:
@@ -57,7 +61,7 @@ class Command(NamedTuple):
                 group.add_argument(*each.flags, **{**each.keywords, "help": words})
 
     def refuse_ignored(self, arguments: argparse.Namespace) -> None:
-        """Refuse options that would be ignored, as others that they need are left out.
+        """Refuse options that would be ignored, for others that are given or left out.
 
         Raises
         ------
@@ -66,6 +70,8 @@ class Command(NamedTuple):
         """
         for each in self.all_options():
             each.refuse_ignored(vars(arguments))
+        if _is(arguments, "quiet") and _is(arguments, "verbose"):
+            raise InputError("`quiet` and `verbose` exclude each other: give one of them")
 
     def inputs(self, arguments: argparse.Namespace) -> list[str]:
         """Return the names in its arguments that may be those of files to read."""
@@ -86,6 +92,11 @@ class Command(NamedTuple):
             for kind, parameter in each.kinds.items()
         }
         return kinds | {each.name: each.flags[-1] for each in options if not each.is_positional}
+
+
+def _is(arguments: argparse.Namespace, name: str) -> bool:
+    """Return whether an option that a command may have is given."""
+    return getattr(arguments, name, False)
 
 
 class Parser(argparse.ArgumentParser):

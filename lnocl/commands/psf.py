@@ -113,6 +113,7 @@ OPTIONS = [
     options.PICTURE.but(help="picture of frame, PSFs and profiles"),
     options.OVERWRITE,
     options.QUIET,
+    options.VERBOSE,
 ]
 
 

@@ -47,6 +47,7 @@ OPTIONS = [
     options.PICTURE.but(help="picture of the image with the stars and their numbers"),
     options.OVERWRITE,
     options.QUIET,
+    options.VERBOSE,
 ]
 
 

@@ -11,7 +11,7 @@ from astropy.units import dimensionless_unscaled
 
 from lnocl.core.scene import units
 from lnocl.core.scene.arrays import Array
-from lnocl.errors import InputError, note, warn
+from lnocl.errors import InputError, detail, note, warn
 from lnocl.io.fitsread import read_contents, read_keyword
 from lnocl.io.headers import CONVERTERS
 from lnocl.io.image_files import ImageFiles
@@ -136,7 +136,7 @@ class Electrons:
             for j, (image, variance, sums) in enumerate(planes)
         ]
         for j, electrons in enumerate(found):
-            note("`images[%d]`: %.4g electrons in its unit, by %s", j, electrons, word)
+            detail("`images[%d]`: %.4g electrons in its unit, by %s", j, electrons, word)
         return np.array(found)
 
     @cached_property

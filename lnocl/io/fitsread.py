@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from lnocl.core.scene.arrays import are_colours
 from lnocl.core.scene.transforms import enlarged
-from lnocl.errors import FileError, InputError, counted, note, warn
+from lnocl.errors import FileError, InputError, counted, detail, note, warn
 from lnocl.io.encoded import linear
 from lnocl.io.fitsfile import open_fits
 from lnocl.io.headers import finer_cards, make_wcs, quiet_log, readable
@@ -179,7 +179,7 @@ def keyword_number(
         return None
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         raise InputError(f"{keyword} of {path} is {value!r}, not a number; give `{name}` as one")
-    note("`images[%d]`: %s %g%s, from %s", j, name.replace("_", " "), value, unit, keyword)
+    detail("`images[%d]`: %s %g%s, from %s", j, name.replace("_", " "), value, unit, keyword)
     return float(value)
 
 

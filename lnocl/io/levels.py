@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from lnocl.core.scene.arrays import Array
 from lnocl.core.scene.noise_check import noise_of
-from lnocl.errors import InputError, note
+from lnocl.errors import InputError, detail, note
 
 Mask = NDArray[np.bool_]
 
@@ -53,7 +53,7 @@ def sky_level(j: int, counts: Array, mask: Mask) -> tuple[float, float]:
     if dark is not None and dark.is_darker_than(level, dark.variance_apart):
         level, error = dark.mean, np.hypot(error, level - dark.mean)
         words = "where it is dark"
-    note(f"`images[{j}]`: background {level:.6g} +- {error:.2g} electrons per pixel ({words})")
+    detail(f"`images[{j}]`: background {level:.6g} +- {error:.2g} electrons per pixel ({words})")
     if level < 0:
         note("`images[%d]`: its sky was subtracted; %.6g electrons are added again", j, -level)
     return float(level), float(error)
@@ -116,7 +116,7 @@ def sky_noise(j: int, counts: Array, mask: Mask) -> float:
         median, scatter = dark.mean, np.sqrt(dark.variance_apart)
         words = "pixels three apart, where it is dark"
     noise = float(np.sqrt(max(scatter**2 - max(median, 0.0), 0.0)))
-    note(f"`images[{j}]`: read noise {noise:.4g} electrons ({words})")
+    detail(f"`images[{j}]`: read noise {noise:.4g} electrons ({words})")
     return noise
 
 

@@ -14,7 +14,7 @@ from lnocl.core.scene.arrays import Array
 from lnocl.core.scene.quantities import in_unit
 from lnocl.core.scene.transforms import rotations, scale_of
 from lnocl.core.scene.units import parse
-from lnocl.errors import FileError, InputError, counted, note, warn
+from lnocl.errors import FileError, InputError, counted, detail, note, warn
 from lnocl.io import sky
 from lnocl.io.fitsfile import open_fits, open_regular
 from lnocl.io.fitsread import Stack, keyword_number, read_keyword
@@ -81,10 +81,10 @@ def _by_coordinates(stack: Stack, paths: Sequence[str]) -> Places:
         larger = f", pixels {scale:.6g} times as large" if (scale := scale_of(each)) > 1 else ""
         if is_turned:
             angle = sky.rotation_angle(each)
-            note("`images[%d]`: turned by %.3f degrees%s, from the WCS", j, angle, larger)
+            detail("`images[%d]`: turned by %.3f degrees%s, from the WCS", j, angle, larger)
         else:
             dx, dy = each[:, 2]
-            note("`images[%d]`: offset %.3f, %.3f pixels in x, y, from the WCS", j, dx, dy)
+            detail("`images[%d]`: offset %.3f, %.3f pixels in x, y, from the WCS", j, dx, dy)
     maps = {"transforms": found} if is_turned else {"offsets": found[:, :, 2]}
     return Places(maps, stack.headers[finest], [])
 

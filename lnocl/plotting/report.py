@@ -63,7 +63,8 @@ def make_report(
     title : str
         Its heading.
     messages : sequence of str, optional
-        The messages of the run; lines that begin with "warning: " stand out.
+        The answer of the run; after an empty line its warnings, which begin with "warning: ", and
+        what was measured and chosen.
     stars : mapping of str to sequence of float, optional
         Columns of the table of stars.
     cards : sequence of (keyword, value, comment), optional
@@ -97,7 +98,7 @@ def make_report(
     template = Template((files("lnocl.plotting") / "report.html").read_text("utf-8"))
     return template.substitute(
         title=html.escape(title),
-        messages=_list(messages),
+        messages=_said(messages),
         stars=_table(stars or {}, "star"),
         found=_found(found),
         curve=_curve(view),
@@ -213,14 +214,23 @@ def _picture(figure: Figure) -> str:
     return base64.b64encode(png_of(figure)).decode("ascii")
 
 
-def _list(lines: Sequence[str]) -> str:
+def _said(lines: Sequence[str]) -> str:
+    """Return the answer of a run, its warnings, and a list to unfold of all else."""
     if not lines:
         return "<p>The file does not hold it.</p>"
-    items = (
-        f"<li{' class=warning' if line.startswith('warning: ') else ''}>{html.escape(line)}</li>"
-        for line in lines
-    )
-    return f"<ul>{''.join(items)}</ul>"
+    end = list(lines).index("") if "" in lines else len(lines)
+    warned = [line for line in lines[end + 1 :] if line.startswith("warning: ")]
+    more = [line for line in lines[end + 1 :] if line not in warned]
+    parts = [f"<pre>{html.escape(chr(10).join(lines[:end]))}</pre>", _list(warned, "warning")]
+    if more:
+        summary = "What was measured and chosen"
+        parts.append(f"<details><summary>{summary}</summary>{_list(more)}</details>")
+    return "".join(parts)
+
+
+def _list(lines: Sequence[str], kind: str = "") -> str:
+    items = "".join(f"<li>{html.escape(line)}</li>" for line in lines)
+    return f"<ul class='{kind}'>{items}</ul>" if lines else ""
 
 
 def _found(view: SignificanceView | None) -> str:

@@ -14,12 +14,13 @@ from numpy.typing import NDArray
 from lnocl.core.runs.outcome import Outcome, PsfRefinement
 from lnocl.core.scene.arrays import Array
 from lnocl.core.scene.observation import Observation
-from lnocl.errors import with_names
+from lnocl.errors import counted, with_names
 from lnocl.notebook import html_card
 from lnocl.plotting.result import draw_result
 from lnocl.residuals import Fit, StarResiduals, judge, residuals
 from lnocl.result.estimate import Callback, Estimate, Iterating
 from lnocl.result.measured import Findings, Measured
+from lnocl.result.summary import summary_lines, with_error
 from lnocl.result.views import view_of
 
 if TYPE_CHECKING:
@@ -35,7 +36,7 @@ MAX_LISTED = 10
 HISTORY_DTYPE = np.dtype([("iteration", np.int64), ("objective", np.float64)])
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Result(Measured):
     """The result of `lnocl.deconvolve`.
 
@@ -288,8 +289,8 @@ class Result(Measured):
     ) -> None:
         """Write a FITS file, which ``lnocl plot`` and ``lnocl report`` read.
 
-        It is the file of ``lnocl deconvolve --residuals``, without the options, the command and
-        the messages of the run, and without ESTIMATE, which needs a command that leads to the
+        It is the file of ``lnocl deconvolve --residuals``, without the options, the command, and
+        what was measured and chosen, and without ESTIMATE, which needs a command that leads to the
         images. The primary HDU holds the extended source. The tables STARS, HALOS, HISTORY,
         HELDOUT and PLAN hold the stars, the amounts of halos, the objectives, the errors that
         held-out counts estimate, and the plan. The cubes MODELS and RESIDUALS hold those of each
@@ -336,7 +337,14 @@ class Result(Measured):
         atomic.check_fits_output(path, overwrite)
         cards = [] if header is None else observed_cards(header, header)
         is_upright = (self._observation.transforms[:, :, :2] == np.eye(2)).all(axis=(1, 2))
-        write_file(self, path, header if is_upright.any() else None, overwrite, cards=cards)
+        write_file(
+            self,
+            path,
+            header if is_upright.any() else None,
+            overwrite,
+            cards=cards,
+            messages=str(self).splitlines(),
+        )
 
     def _repr_html_(self) -> str:
         """Return a table for a notebook, with a thumbnail where matplotlib is there."""
@@ -349,7 +357,7 @@ class Result(Measured):
             "iterations": f"{self.n_iter} ({self.stop_reason})",
             "stars": "\n".join(shown) or "none",
             "extended source": "{:.5g} +- {:.2g}".format(*self.extended_flux),
-            **({"halos": "\n".join(self._halo_lines())} if self.halo_fluxes.size else {}),
+            **dict(self._halo_rows()),
             "device": self.device,
         }
         return html_card("lnocl.Result", rows, self.extended)
@@ -358,20 +366,47 @@ class Result(Measured):
     def _unit(self) -> str:
         return "electron/s" if self._findings.setup.is_rate else "electron"
 
-    def _halo_lines(self) -> list[str]:
-        """Return the amounts of each halo in words, electrons."""
-        lines = []
+    def __str__(self) -> str:
+        """Return the fluxes, whether to trust them, and how the run ended, in a few lines.
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> import lnocl
+        >>> y, x = np.indices((33, 33)) - 16
+        >>> psf = np.exp(-(x**2 + y**2) / 4)
+        >>> image = np.random.default_rng(0).poisson(50 + 1e5 * psf / psf.sum())
+        >>> observation = lnocl.Observation(image, psf, background=50, psf_error=0)
+        >>> result = lnocl.deconvolve(observation, [(16, 16)], stop=None, n_iter=20, engine="numpy")
+        >>> print(result)
+        star 1 (16, 16)  99 990 +- 330 electrons
+        extended            180 +- 250 electrons in the frame
+        trust            yes: residuals are noise, the PSF fits
+        20 iterations, all that were allowed
+        """
+        return with_names("\n".join(summary_lines(self)))
+
+    def __repr__(self) -> str:
+        shape = " x ".join(map(str, self.extended.shape[::-1]))
+        return (
+            f"<lnocl.{type(self).__name__} of {counted(len(self.star_positions), 'star')} and "
+            f"{shape} pixels after {counted(self.n_iter, 'iteration')}>"
+        )
+
+    def _halo_rows(self) -> list[tuple[str, str]]:
+        """Return the name of each halo, and its amounts in words, electrons."""
+        rows = []
         pairs = zip(self.halo_fluxes, self.halo_flux_errors, strict=True)
         for k, (fluxes, errors) in enumerate(pairs, 1):
             if len(fluxes) == 1:
-                amount = f"{fluxes[0]:.6g} +- {errors[0]:.2g} electrons"
+                amount = f"{with_error(fluxes[0], errors[0])} electrons"
             else:
                 amount = (
                     f"{fluxes.min():.6g} to {fluxes.max():.6g} electrons in "
                     f"{len(fluxes)} images, with errors of {np.median(errors):.2g} (median)"
                 )
-            lines.append(f"halo {k}: {amount}")
-        return lines
+            rows.append((f"halo {k}", amount))
+        return rows
 
     def fit(self) -> Fit:
         """Return how well the model fits all good pixels.

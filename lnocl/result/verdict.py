@@ -51,31 +51,29 @@ def faults(result: Result) -> list[str]:
     what noise leaves; light all round a star, as a PSF that is too narrow leaves it; and light that
     star and host may exchange.
     """
-    unfitted, lit, dark, lost, paired = (_Told() for _ in range(5))
     findings, at_stars, overall = result._findings, result.star_residuals(), result.fit()
     n_epochs = findings.observation.n_epochs
+    unfitted, lit, dark, lost, paired = (_Told(n_epochs) for _ in range(5))
     for s, (place, given, flux, found) in enumerate(
         zip(
             result.star_positions, findings.given_positions, result.star_fluxes, at_stars,
             strict=True,
         )
     ):  # fmt: skip
-        star, epoch = divmod(s, n_epochs)
-        then = f" in epoch {epoch}" if n_epochs > 1 else ""
         if np.isnan(flux):  # no image shows it, as the run has told
             continue
         if not flux > NO_LIGHT:
             where = _elsewhere(result.extended, place, findings.observation.oversample)
-            dark.add(star, f"{in_words(given)}{then}{where}")
+            dark.add(s, in_words(given), where)
             continue
         if np.hypot(*(place - given)) > AT_LIMIT * MAX_SHIFT:
-            lost.add(star, f"{in_words(given)} to {in_words(place)}")
+            lost.add(s, in_words(given), f" to {in_words(place)}")
         if found.is_misfit:
-            unfitted.add(star, f"{in_words(place)}{then}")
+            unfitted.add(s, in_words(place))
         if found.has_halo:
-            lit.add(star, f"{in_words(place)}{then}, {100 * found.halo:.0f} %")
+            lit.add(s, in_words(place), share=found.halo)
         if found.is_like_host:
-            paired.add(star, f"{in_words(place)}{then}, {100 * found.exchanged:.0f} %")
+            paired.add(s, in_words(place), share=found.exchanged)
     lines = []
     if dark:
         lines.append(f"no light is left for {dark.count()}: {dark.words('; ')}")
@@ -121,20 +119,35 @@ def faults(result: Result) -> list[str]:
     return lines
 
 
-class _Told(dict[int, dict[str, None]]):
-    """What is told of each star, once where several epochs say the same."""
+class _Told:
+    """What is told of stars, once of each, whatever epochs it is of."""
 
-    def add(self, star: int, words: str) -> None:
-        """Add what is told of a star."""
-        self.setdefault(star, {})[words] = None
+    def __init__(self, n_epochs: int) -> None:
+        self._n_epochs = n_epochs
+        self._found: dict[int, list[tuple[int, str, str, float]]] = {}
+
+    def __len__(self) -> int:
+        return len(self._found)
+
+    def add(self, s: int, place: str, more: str = "", share: float = np.nan) -> None:
+        """Add what is told of flux `s`: the star's place, more words, and a share of its light."""
+        star, epoch = divmod(s, self._n_epochs)
+        self._found.setdefault(star, []).append((epoch, place, more, share))
 
     def count(self) -> str:
         """Return how many stars these are."""
         return counted(len(self), "star")
 
     def words(self, between: str) -> str:
-        """Return the first of what is told."""
-        return between.join([each for told in self.values() for each in told][:3])
+        """Return what is told of the first three."""
+        return between.join([self._of_star(each) for each in [*self._found.values()][:3]])
+
+    def _of_star(self, found: list[tuple[int, str, str, float]]) -> str:
+        epoch, place, more, _ = found[0]
+        when = f" in {counted(len(found), 'epoch')}" if len(found) > 1 else f" in epoch {epoch}"
+        ends = [f"{100 * end([share for *_, share in found]):.0f}" for end in (min, max)]
+        shares = "" if ends[0] == "nan" else f", {' to '.join(dict.fromkeys(ends))} %"
+        return f"{place}{when * (self._n_epochs > 1)}{more}{shares}"
 
 
 def in_words(place: Iterable[float]) -> str:

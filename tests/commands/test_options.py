@@ -20,7 +20,7 @@ from lnocl.io.calibration import Calibration
 pytestmark = pytest.mark.usefixtures("command_folder")
 
 # Options of lnocl deconvolve that no function takes as they are.
-OF_THE_SHELL = {"images", "output", "overwrite", "plot", "quiet", "residuals",
+OF_THE_SHELL = {"images", "output", "overwrite", "plot", "quiet", "verbose", "residuals",
                 "star_table",
                 "parallel", "tile"}  # fmt: skip
 # Parameters of lnocl.deconvolve that the shell gives itself, or that no option gives.

@@ -42,7 +42,7 @@ def test_an_unnamed_star_is_told_and_a_named_one_is_not(capsys):
 
 
 def test_the_error_of_a_measured_background_is_in_that_of_the_extended_source(capsys):
-    measured = run("--background", "auto", "--star", "16,20")
+    measured = run("--background", "auto", "--star", "16,20", "--verbose")
     line = next(line for line in capsys.readouterr().err.splitlines() if "background" in line)
     level, error = (float(line.split()[k]) for k in (4, 6))
     given = run("--background", repr(float(measured["BKG1"])), "--star", "16,20")

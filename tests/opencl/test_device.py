@@ -212,7 +212,7 @@ def test_too_little_memory_is_refused_before_anything_is_allocated(monkeypatch, 
 )
 def test_memory_estimate_is_what_the_buffers_hold(shape, tuning, caplog):
     """With scratch in local memory, of which 32 KiB will do, and with scratch in global memory."""
-    caplog.set_level("INFO", "lnocl")
+    caplog.set_level("DEBUG", "lnocl")
     observation = lnocl.Observation(np.ones((2, *shape)), np.ones((1, 1)))
     engine = opencl.OpenCLEngine(opencl.Scene(observation), "single", None, 10, tuning)
     engine.extended()  # waits for the device

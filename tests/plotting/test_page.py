@@ -107,7 +107,7 @@ def test_it_needs_no_other_file_and_evaluates_nothing_of_the_result():
     page = make_report(
         dataclasses.replace(make_view(p=1), unit=wicked),
         wicked,
-        [wicked, f"warning: {wicked}"],
+        [wicked, "", f"warning: {wicked}", wicked],
         {wicked: [1.0]},
         [("OBJECT", wicked, wicked)],
         wicked,
@@ -115,7 +115,7 @@ def test_it_needs_no_other_file_and_evaluates_nothing_of_the_result():
     assert "<script>alert" not in page
     assert "<img src=http" not in page
     assert page.count("</script>") == 2
-    assert len(re.findall(r"<li class=warning>warning: ", page)) == 1
+    assert len(re.findall(r"<ul class='warning'><li>warning: ", page)) == 1
     links = re.findall(r"""(?:src|href)\s*=\s*["']?([^"'> ]{0,30})""", page)
     assert links
     assert all(link.startswith("data:") for link in links if "example.com" not in link)
@@ -130,7 +130,7 @@ class TestCommand:
     @pytest.fixture(autouse=True)
     def _folder(self, tmp_path, monkeypatch):
         monkeypatch.chdir(tmp_path)
-        cube, said = np.ones((1, 32, 32)), ["warning: it is noisy", "the model fits"]
+        cube, said = np.ones((1, 32, 32)), ["the model fits", "", "gain 2", "warning: it is noisy"]
         fitswrite.write_result(
             "a.fits",
             np.ones((32, 32)),
@@ -146,7 +146,9 @@ class TestCommand:
         assert capsys.readouterr().out == "written to a.html: open it in a browser\n"
         page = Path("a.html").read_text()
         for part in ("<title>a.fits: RW Aur</title>", "lnocl deconvolve b.fits", "the model fits",
-                     "<li class=warning>warning: it is noisy", "<td>7.5</td>"):  # fmt: skip
+                     "<pre>the model fits</pre>",
+                     "<ul class='warning'><li>warning: it is noisy", "<li>gain 2</li>",
+                     "<td>7.5</td>"):  # fmt: skip
             assert part in page
         assert "/home/me" not in page
         assert "datadata" not in page

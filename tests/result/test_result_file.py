@@ -29,7 +29,7 @@ WORDS += ["none", "--n-iter", "3", "--engine", "numpy", "--pad", "0", "--residua
 DECONVOLVE = inspect.signature(lnocl.deconvolve).parameters
 OPTIONS = {"smoothing": 0.1, "stop": None, "n_iter": 3, "engine": "numpy", "pad": 0}
 # What the command leads to, and what it has said.
-OF_SHELL = "MESSAGES", "ESTIMATE"
+OF_SHELL = ("ESTIMATE",)
 WCS = {
     "CTYPE1": "RA---TAN", "CTYPE2": "DEC--TAN", "CRVAL1": 65.0, "CRVAL2": 19.5,
     "CRPIX1": 10.0, "CRPIX2": 20.0, "CDELT1": -1e-4, "CDELT2": 1e-4,
@@ -145,7 +145,10 @@ def test_python_and_the_shell_write_the_same(case):
         names = [hdu.name for hdu in one]
         assert [hdu.name for hdu in other if hdu.name not in OF_SHELL] == names
         for name in names:
-            np.testing.assert_equal(one[name].data, other[name].data, name)
+            n = len(one[name].data) if name == "MESSAGES" else None  # the shell has more of them
+            np.testing.assert_equal(one[name].data[:n], other[name].data[:n], name)
+            if n is not None:
+                continue
             found, expected = cards(other[name].header), cards(one[name].header)
             of_command = {k for k in found if re.sub(r"\d+$", "", k) in words}
             assert {k: found[k] for k in found if k not in of_command - {*expected}} == expected

@@ -42,7 +42,7 @@ def test_at_most_half_the_shorter_side_and_at_least_one():
 @pytest.mark.parametrize("engine", ["numpy", pytest.param("opencl", marks=pytest.mark.exhaustive)])
 def test_auto_is_that_pad_and_is_announced(engine, caplog):
     observation = lnocl.Observation(np.random.default_rng(0).poisson(9.0, (64, 64)), GAUSSIAN)
-    with caplog.at_level(logging.INFO, "lnocl"):
+    with caplog.at_level(logging.DEBUG, "lnocl"):
         found = paper(observation, pad="auto", n_iter=2, engine=engine)
     words = "pad chosen: 7 pixels, as light runs over the edge of the images"
     assert words in caplog.messages
@@ -60,7 +60,7 @@ def test_auto_is_no_pad_where_no_light_runs_over_the_edge(caplog):
         mask = np.isnan(images)
         observation = lnocl.Observation(np.ma.masked_array(images, mask), GAUSSIAN, background=20.0)
         assert choose_pad(observation) == 0
-    with caplog.at_level(logging.INFO, "lnocl"):
+    with caplog.at_level(logging.DEBUG, "lnocl"):
         assert Scene(observation, pad="auto").grid == (64, 64)
     words = "pad chosen: 0 pixels, as no light runs over the edge of the images"
     assert words in caplog.messages

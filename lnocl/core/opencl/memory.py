@@ -15,7 +15,7 @@ from lnocl.core.opencl.device import describe
 from lnocl.core.opencl.launch import READ_WRITE
 from lnocl.core.opencl.layout import Layout
 from lnocl.core.scene.arrays import Array
-from lnocl.errors import DeviceError, InputError, note
+from lnocl.errors import DeviceError, InputError, detail
 
 # Buffers of which each member of a batch has its own.
 OWN = {
@@ -225,7 +225,7 @@ def held_bytes() -> tuple[int, int]:
 
 def announce(device: cl.Device, device_bytes: int, host_bytes: int, tuned: str) -> None:
     """Log what a scene takes on a device and on the host, and the tuning of the device."""
-    note(
+    detail(
         "%s: the scene takes %.1f MiB there, and up to %.0f MiB of the host's memory; %s",
         describe(device),
         device_bytes / 2**20,

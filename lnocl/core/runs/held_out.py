@@ -25,7 +25,7 @@ from lnocl.core.runs.thinning import split_counts
 from lnocl.core.scene.arrays import Array
 from lnocl.core.scene.estimate import Estimate
 from lnocl.core.scene.penalty import Penalty
-from lnocl.errors import InputError, note, warn
+from lnocl.errors import InputError, detail, warn
 from lnocl.process import ignored_notes
 
 # The halves run to this multiple of the chosen iteration, so that the references are resolved.
@@ -130,7 +130,7 @@ class HeldOutCounts:
         best = cast(_Best, self._best)
         penalty = self._penalties[best.trial]
         if len(self._penalties) > 1:
-            note(f"`smoothing` chosen: {penalty.in_words()}, by held-out counts")
+            detail(f"`smoothing` chosen: {penalty.in_words()}, by held-out counts")
         outcome = self._outcome(best.chosen, penalty, best.objectives, "held-out")
         return replace(outcome, curve=np.concatenate(self._curves))
 

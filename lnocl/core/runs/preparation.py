@@ -18,7 +18,7 @@ from lnocl.core.runs.steady import STEADY, steady_penalty
 from lnocl.core.scene.arrays import Array
 from lnocl.core.scene.observation import Observation
 from lnocl.core.scene.penalty import Penalty, recommend_smoothing
-from lnocl.errors import NotFiniteError, note
+from lnocl.errors import NotFiniteError, detail
 
 # Of the smoothing that is recommended, from which held-out counts choose besides none.
 MULTIPLES = (1.0, 3.0, 10.0)
@@ -150,5 +150,5 @@ def _penalties(plan: Plan, mended: Mended, are_psfs_wrong: bool) -> list[Penalty
     weights = (each * recommended for each in multiples)
     penalties = [Penalty(plan.mu, each, near_stars=mended.near_stars) for each in weights]
     if reason:
-        note(f"`smoothing` chosen: {penalties[0].in_words()}, by {reason}")
+        detail(f"`smoothing` chosen: {penalties[0].in_words()}, by {reason}")
     return penalties

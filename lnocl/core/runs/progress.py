@@ -8,7 +8,7 @@ import threading
 import time
 from collections.abc import Callable
 
-log = logging.getLogger("lnocl.progress")
+LOG = logging.getLogger("lnocl.progress")
 
 # Seconds between two updates: each reads the objective, and waits for the device.
 PROGRESS_INTERVAL = 0.1
@@ -98,7 +98,7 @@ class Progress:
             if self._bar is not None:
                 self._bar.refresh()
             else:
-                log.info(self._line())
+                LOG.info(self._line())
 
     def _line(self) -> str:
         minutes = (time.monotonic() - self._start) / 60.0

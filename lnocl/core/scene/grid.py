@@ -11,7 +11,7 @@ from lnocl.core.scene.line_weights import TAPS
 from lnocl.core.scene.observation import Observation
 from lnocl.core.scene.padding import choose_pad
 from lnocl.core.scene.rotation import PHASE_ROWS, cropped
-from lnocl.errors import InputError, note
+from lnocl.errors import InputError, detail
 
 MAX_AXIS = 8192
 # Odd factors of an axis, and the least power of two beside them: a transform takes blocks of 8
@@ -45,7 +45,7 @@ def grid_of(observation: Observation, pad: object) -> tuple[int, int]:
     if isinstance(pad, str) and pad == "auto":
         pad = choose_pad(observation)
         reason = "light runs" if pad else "no light runs"
-        note("`pad` chosen: %d pixels, as %s over the edge of the images", pad, reason)
+        detail("`pad` chosen: %d pixels, as %s over the edge of the images", pad, reason)
     shape = extent(observation) if observation.is_turned else observation.shape
     pad = whole("pad", pad, 0, ", or auto")
     # Light that is farther from its source than the images are wide reaches none of them.

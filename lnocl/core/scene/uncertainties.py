@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lnocl.core.scene.arrays import Array, numbers
-from lnocl.errors import InputError, counted, note
+from lnocl.errors import InputError, counted, detail
 
 # A gain that follows from the errors leaves them below the noise of the counts by so much.
 ROUNDING = 0.05
@@ -90,7 +90,7 @@ def without_source(
                 f"see to gain and exposure, or give it as {words[1]} if it leaves the source out"
             )
         median = np.sqrt(np.median(left[~bad].clip(0.0))) if not bad.all() else 0.0
-        note(
+        detail(
             "`images[%d]`: noise apart from that of its counts %.3g electrons in the median; %s "
             "whose error is less than the noise of its counts %s none",
             j,

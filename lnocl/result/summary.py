@@ -1,0 +1,245 @@
+"""What a result says in words: fluxes and their errors, whether to trust them, how it ended."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterator, Sequence
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lnocl.core.scene.counts import means
+from lnocl.core.scene.stars import MAX_SHIFT
+from lnocl.errors import counted
+from lnocl.residuals import Fit, sharp_sources
+from lnocl.result.verdict import in_words
+
+if TYPE_CHECKING:
+    from lnocl.core.scene.observation import Observation
+    from lnocl.result import Result
+
+# Stars, and epochs, that have a line each; those of whose stars a table has columns.
+MAX_LISTED, MAX_COLUMNS = 12, 4
+# The darkest share of the extended source, and how bright it may be, in standard deviations of a
+# pixel's noise.
+DARK_SHARE, FLOOR = 0.05, 0.5
+# Of a star that is masked in all images, or in all of its epoch.
+NOT_SHOWN = "unknown, as no good pixel shows it"
+# Numbers from the first on, and those whose error is below the second, have an exponent.
+LARGE, SMALL = 1e7, 1e-4
+# A number that its error follows.
+NUMBER = re.compile(r"[-+.\de ]+(?= \+-)")
+
+ENDS = {
+    "n_iter": ", all that were allowed",
+    "held-out": "{and_smoothing} by held-out counts",
+    "discrepancy": ": the data are fitted as well as noise allows",
+    "change": ": the objective hardly changes any more",
+    "converged": ": no step lowers the objective any more",
+    "diverged": ": the objective rose after the last",
+    "not finite": ": the objective was not finite after the last",
+    "interrupt": ": it was interrupted",
+    "callback": ": the callback ended it",
+}
+
+
+class Unit(NamedTuple):
+    """A unit of flux: its name in the plural, and the electrons that it is."""
+
+    name: str
+    electrons: float = 1.0
+
+    def flux(self, value: float, error: float) -> str:
+        """Return a flux and its error, given in electrons, in this unit."""
+        return f"{with_error(value / self.electrons, error / self.electrons)} {self.name}"
+
+
+def with_error(value: float, error: float) -> str:
+    """Return a number and its error, both to two digits of the error.
+
+    Examples
+    --------
+    >>> from lnocl.result.summary import with_error
+    >>> with_error(142837.2, 314.0), with_error(0.0123456, 0.00098), with_error(3.53185e7, 1.1e6)
+    ('142 840 +- 310', '0.01235 +- 0.00098', '3.53e+07 +- 1.1e+06')
+    """
+    if not math.isfinite(value):
+        return "unknown"
+    if not math.isfinite(error) or error <= 0.0:
+        return f"{value:.6g}"
+    last = int(f"{error:.1e}".partition("e")[2]) - 1  # the place of the error's second digit
+    largest = max(abs(value), error)
+    if largest >= LARGE or error < SMALL:
+        digits = max(int(f"{value:.0e}".partition("e")[2]) - last, 0) if value else 0
+        return f"{value:.{digits}e} +- {error:.1e}"
+    numbers = (f"{round(each, -last) + 0.0:,.{max(-last, 0)}f}" for each in (value, error))
+    return " +- ".join(numbers).replace(",", " ")
+
+
+def summary_lines(result: Result, unit: Unit | None = None, is_warned: bool = False) -> list[str]:
+    """Return the fluxes of a result, whether to trust them, and how it ended, in a few lines.
+
+    Parameters
+    ----------
+    result : Result
+        The result.
+    unit : Unit, optional
+        That of the images (default: electrons, per second where exposures were given).
+    is_warned : bool, optional
+        Whether there were warnings beside those of a model that does not fit.
+    """
+    unit = unit or Unit(result._unit.replace("electron", "electrons"))
+    curves = _light_curves(result, unit)
+    rows = [] if curves else _star_rows(result, unit)
+    rows += result._halo_rows()
+    rows.append(("extended", f"{unit.flux(*result.extended_flux)} in the frame"))
+    verdict, *more = _trust(result, unit, is_warned)
+    rows += [("trust", verdict), *(("", each) for each in more)]
+    return [*curves, *_aligned(rows), _end(result)]
+
+
+def _aligned(rows: Sequence[tuple[str, str]]) -> list[str]:
+    """Return labels and words in two columns, and numbers with their errors one below another."""
+    found = [NUMBER.match(words) for _, words in rows]
+    width = max(len(label) for label, _ in rows)
+    most = max(each.end() for each in found if each)
+    return [
+        f"{label:{width}}  {' ' * (most - number.end() if number else 0)}{words}".rstrip()
+        for (label, words), number in zip(rows, found, strict=True)
+    ]
+
+
+def details(result: Result) -> list[str]:
+    """Return what else a result can say: its residuals and its objective, a line each."""
+    at_stars = zip(result.star_positions, result.star_residuals(), strict=True)
+    return [
+        f"residuals, 1 for noise alone: {_rms(result.fit())} in all",
+        *(
+            f"residuals at the star at {in_words(place)}: {_rms(found.core)} in its core, "
+            f"{_rms(found.wings)} in its wings"
+            for place, found in at_stars
+            if found.core.n_pixels
+        ),
+        f"objective {result.history['objective'][-1]:.6g} on {result.device}",
+    ]
+
+
+def _star_rows(result: Result, unit: Unit) -> list[tuple[str, str]]:
+    """Return label and flux of each star, of one epoch or of several."""
+    n, shown = result._observation.n_epochs, []
+    stars = result.star_positions[::n], result.star_fluxes, result.star_flux_errors
+    fluxes, errors = (np.reshape(each, (-1, n)) for each in stars[1:])
+    for k, (place, flux, error) in enumerate(zip(stars[0], fluxes, errors, strict=True), 1):
+        seen, words = np.isfinite(flux), NOT_SHOWN
+        if seen.any() and n == 1:
+            words = unit.flux(flux[0], error[0])
+        elif seen.any():
+            ends = flux[seen].min(), flux[seen].max()
+            low, high = (with_error(each / unit.electrons, 0.0) for each in ends)
+            middle = float(f"{np.median(error[seen]) / unit.electrons:.2g}")
+            words = f"{low} to {high} {unit.name} in {seen.sum()} epochs, +- {middle:g} in each"
+        shown.append((f"star {k} {_rounded(place)}", words))
+    n_more = len(shown) - MAX_LISTED
+    return shown if n_more <= 1 else [*shown[:MAX_LISTED], (f"{n_more} more stars", "in its table")]
+
+
+def _light_curves(result: Result, unit: Unit) -> list[str]:
+    """Return a table with a row for each epoch and a column for each star, if they are few."""
+    n = result._observation.n_epochs
+    n_stars = len(result.star_fluxes) // n
+    if not (1 < n <= MAX_LISTED and 0 < n_stars <= MAX_COLUMNS):
+        return []
+    pairs = zip(result.star_fluxes, result.star_flux_errors, strict=True)
+    words = [with_error(flux / unit.electrons, error / unit.electrons) for flux, error in pairs]
+    heads = [f"star {k} {_rounded(place)}" for k, place in enumerate(result.star_positions[::n], 1)]
+    columns = [
+        ["epoch", *map(str, range(n))],
+        *([head, *words[k * n : (k + 1) * n]] for k, head in enumerate(heads)),
+    ]
+    widths = [max(map(len, column)) for column in columns]
+    rows = [
+        "  ".join(f"{cell:>{width}}" for cell, width in zip(row, widths, strict=True))
+        for row in zip(*columns, strict=True)
+    ]
+    rows[0] += f"  {unit.name}"
+    return rows
+
+
+def _trust(result: Result, unit: Unit, is_warned: bool) -> Iterator[str]:
+    """Yield whether to trust a result and why not; then what its extended source may hold."""
+    from lnocl.result.verdict import faults
+
+    first, *others = faults(result) or [""]
+    if first:
+        yield f"no: {first}"
+        yield from others
+    elif is_warned:
+        yield "yes, but see the warnings: residuals are noise"
+    else:
+        fits = ", the PSF fits" if np.isfinite(result.star_fluxes).any() else ""
+        yield f"yes: residuals are noise{fits}"
+    yield from _floor(result, unit)
+    yield from _unnamed(result, unit)
+    yield from _shortness(result)
+
+
+def _rounded(place: NDArray[np.float64]) -> str:
+    return in_words(np.round(place, 2))
+
+
+def _end(result: Result) -> str:
+    smoothing = f" and smoothing {result.smoothing:.3g}" if result.held_out.size else ""
+    why = ENDS[result.stop_reason].format(and_smoothing=smoothing)
+    return f"{counted(result.n_iter, 'iteration')}{why}"
+
+
+def _shortness(result: Result) -> Iterator[str]:
+    if result.n_iter <= 1 and result.stop_reason not in ("interrupt", "callback", "n_iter"):
+        yield (
+            f"it ended after {counted(result.n_iter, 'iteration')}: there is little but noise, or "
+            "PSF, background or noise are wrong"
+        )
+
+
+def _unnamed(result: Result, unit: Unit) -> Iterator[str]:
+    """Yield a line on sources in the extended source that are as sharp as stars."""
+    observation = result._observation
+    levels = means(observation.background, observation.mask)
+    background = float((levels / _areas(observation)).sum())
+    # Of all images, whose noise tells.
+    exposure = float(means(observation.exposure, observation.mask).sum())
+    found = sharp_sources(result.extended * exposure, background, observation.oversample)
+    found = found / (1.0, 1.0, exposure)
+    offsets = found[:, None, :2] - result.star_positions
+    found = found[(np.hypot(*np.moveaxis(offsets, -1, 0)) > MAX_SHIFT).all(axis=1)]
+    if len(found):
+        (x, y, light), n = found[0], len(found)
+        yield (
+            f"{counted(n, 'source')} in the extended source {'is' if n == 1 else 'are'} as sharp "
+            f"as stars, the brightest at ({x:.7g}, {y:.7g}) with {light / unit.electrons:.3g} "
+            f"{unit.name}: give them as `stars` too; lnocl stars lists them"
+        )
+
+
+def _floor(result: Result, unit: Unit) -> Iterator[str]:
+    """Yield a line where the extended source is nowhere dark."""
+    observation = result._observation
+    darkest = float(np.quantile(result.extended, DARK_SHARE))
+    counts = darkest * _areas(observation) * means(observation.exposure, observation.mask)
+    levels = means(observation.background, observation.mask)
+    if (counts > FLOOR * np.sqrt(levels + counts)).any():
+        yield (
+            f"the extended source is hardly darker anywhere than {darkest / unit.electrons:.3g} "
+            f"{unit.name} a pixel: the background is too low by that, or light fills the frame"
+        )
+
+
+def _areas(observation: Observation) -> NDArray[np.float64]:
+    """Return how many pixels of the sky are one of each image."""
+    return np.asarray((observation.oversample * observation.scales) ** 2)
+
+
+def _rms(fit: Fit) -> str:
+    return f"{fit.rms:.2f} +- {fit.error:.2f}" if fit.n_pixels else "unknown (no good pixel)"
