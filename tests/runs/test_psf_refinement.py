@@ -128,7 +128,7 @@ def test_what_parameters_cannot_mend_is_left_and_said(caplog):
     assert not result.psf_refinement.is_accepted
     before, after = result.psf_refinement.misfit
     assert 2 < before == after
-    (said,) = re.findall("PSFs left as given: their misfit is (.+), refined (.+), w", caplog.text)
+    (said,) = re.findall("PSFs not changed: misfit (.+), refined (.+); noise has 1; too", caplog.text)
     assert float(said[0]) == pytest.approx(before, rel=0.01)
     assert float(said[1]) < 0.9 * before
     np.testing.assert_array_equal(result.psfs, [PSF / PSF.sum()])
@@ -148,7 +148,7 @@ class TestAnErrorThatIsLeft:
         true = np.linalg.norm(self.TRUE - PSF) / np.linalg.norm(PSF)
         found = result.psf_refinement
         assert found.psf_error == pytest.approx(true, rel=0.3)
-        assert "PSFs left as given" in caplog.text
+        assert "PSFs not changed" in caplog.text
         plain = refine(images, PSF, (), n_iter=300)
         assert error(result) < 0.2 * error(plain)
         near = result._outcome.scene.penalty.near_stars
@@ -509,7 +509,10 @@ def test_phases_are_searched_from_several_places():
 
 @pytest.mark.system
 def test_a_blur_beside_a_faint_star_is_found():
-    """With rounds that begin after 8 iterations the source explains a quarter of it."""
+    """With rounds that begin after 8 iterations the source explains a quarter of it.
+
+    PSFs are 0.15 off before. The rounding of another BLAS decides between 0.007 and 0.024.
+    """
     n, scale = 256, (Experiment().wavelength, Experiment().pixel_scale)
     psfs, ideals = (
         [fizeau_psf((n, n), 45.0 * j * u.deg, *scale, strehl, j) for j in range(4)]
@@ -532,7 +535,7 @@ def test_a_blur_beside_a_faint_star_is_found():
     names, options = ["shift", "jitter", "strehl"], {"n_iter": 1, "stop": None, "pad": 0}
     result = lnocl.deconvolve(observation, [(at.x, at.y)], refine_psfs=names, **options)
     assert result.psf_refinement.is_accepted
-    assert np.linalg.norm(result.psfs - true) < 0.02 * np.linalg.norm(true)
+    assert np.linalg.norm(result.psfs - true) < 0.03 * np.linalg.norm(true)
 
 
 def test_a_round_source_is_not_taken_for_the_star():

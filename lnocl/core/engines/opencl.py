@@ -433,4 +433,6 @@ class OpenCLEngine:
             self._memory.upload_raw("star_steps", state["star_fluxes"])
         steps = Steps(*state["steps"].tolist())
         self._judge_estimate(Steps(recorded=steps.recorded - 1))
+        # Where no step was left, the sums of the estimate are those of the step that was refused.
+        self._memory.upload_raw("objectives", state["objectives"])
         self._set(steps)
