@@ -239,7 +239,7 @@ def _summarise(found: Bootstrap, parts: Sequence[Part], frames: Frames) -> list[
     for row in table[:n_listed]:
         note = f"; {row['note']}: do not trust its error" if row["note"] else ""
         if not _OF_STARS.fullmatch(row["name"]) and np.isfinite(row["share"]):
-            note = f"; there in {100 * row['share']:.0f} % of replicas{note}"
+            note = f"; has light in {100 * row['share']:.0f} % of replicas{note}"
         if len(found.of_psfs):
             note += f"; noise {row['error_noise']:.2g}, PSF {row['error_psf']:.2g}"
         lines.append(

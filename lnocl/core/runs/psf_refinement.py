@@ -37,7 +37,7 @@ from lnocl.core.scene.psfs import MOST_PSF_ERROR
 from lnocl.core.scene.star_psfs import owned
 from lnocl.core.solvers.companions import Companion, companions
 from lnocl.core.solvers.psf_fit import step
-from lnocl.errors import DivergedError, NotFiniteError, counted, note, warn
+from lnocl.errors import DivergedError, NotFiniteError, counted, detail, note, warn
 from lnocl.process import ignored_notes, ignored_warnings
 
 # A mend is taken where it leaves less than this share of kappa, or nothing to doubt, and a misfit
@@ -149,7 +149,7 @@ def mend(runs: GuardedRuns, names: Sequence[str], moves: bool | str, is_asked: b
     may_err = bool(observation.psf_error) or state.misfit.is_doubtful
     if names and may_err and are_noisy(observation.psfs):
         state = _clean(runs, state)
-    done = ["the noise of wings taken"] if state.psfs is not psfs else []
+    done = ["noise of their wings removed"] if state.psfs is not psfs else []
     if names and observation.psf_error:
         settled = _settle(runs, state, moves is not False)
         if settled is not state:
@@ -394,21 +394,19 @@ def _tell(given: _State, state: _State, tried: _State, done: Sequence[str]) -> N
     before, after, found = (each.misfit.reduced for each in (given, state, tried))
     if done:
         note(
-            f"PSFs refined, {', '.join(done)}: their misfit is {after:.3g} instead of "
-            f"{before:.3g}, where noise gives 1"
+            f"PSFs refined, {', '.join(done)}: misfit {after:.3g}, before {before:.3g}; noise has 1"
         )
     elif state.moves and not given.moves:
         note(
-            f"positions refined: the misfit of the stars is {after:.3g} instead of {before:.3g}, "
-            "where noise gives 1"
+            f"positions refined: misfit of the stars {after:.3g}, before {before:.3g}; noise has 1"
         )
     elif tried is not given:
         note(
-            f"PSFs left as given: their misfit is {before:.3g}, refined {found:.3g}, "
-            "where noise gives 1; too much of the error is left, or a star loses its light"
+            f"PSFs not changed: misfit {before:.3g}, refined {found:.3g}; noise has 1; too much of "
+            "the error is left, or a star loses its light"
         )
     else:
-        note(f"the misfit of the PSFs is {before:.3g}, where noise gives 1")
+        detail(f"misfit of the PSFs {before:.3g}; noise has 1")
 
 
 def _warn(refinement: PsfRefinement, setup: Setup) -> None:

@@ -100,7 +100,7 @@ class Discrepancy(Rule):
         self._expected = self._expect(run)
         warn(
             f"the discrepancy was not reached: after {run.done} iterations it is "
-            f"{self._discrepancy(run):.3g}, where noise gives 1; see to PSFs and noise, or raise "
+            f"{self._discrepancy(run):.3g}, and noise alone has 1; see to PSFs and noise, or raise "
             "`n_iter`"
         )
 

@@ -76,9 +76,10 @@ class Penalty:
 
     def in_words(self) -> str:
         """Return the weight of the edge-preserving term as a message has it."""
-        near = self.near_stars
-        more = "" if near is None else f", and up to {near.max():.3g} more at the stars"
-        return f"{self.smoothing:.3g}{more}"
+        if self.near_stars is None:
+            return f"{self.smoothing:.3g}"
+        most = self.smoothing + self.near_stars.max()
+        return f"{self.smoothing:.3g}, and {most:.3g} at the stars, where PSFs may be wrong"
 
 
 def recommend_smoothing(observation: Observation) -> float:
