@@ -23,11 +23,11 @@ from lnocl.core.runs.outcome import Outcome
 from lnocl.core.runs.plan import HALOS, LEVELS, PSFS, STARS, Plan
 from lnocl.core.runs.plan import plan as make_plan
 from lnocl.core.runs.preparation import Prepared, prepare, quietly
-from lnocl.core.runs.progress import Progress
 from lnocl.core.scene.observation import Observation
 from lnocl.core.scene.psf_families import Family
 from lnocl.core.solvers import SolverName
 from lnocl.errors import detail
+from lnocl.progress import Progress
 from lnocl.reconstruction import reconstruct
 from lnocl.residuals import judge_stars
 from lnocl.result import Callback, Result, make_result
@@ -414,7 +414,7 @@ def _finish(outcome: Outcome, plan: Plan, prepared: Prepared, progress: bool) ->
     has_halos, has_levels = plan.does(HALOS), plan.does(LEVELS)
     if is_within or has_halos or has_levels:
         what = "fitting stars, halos and levels"
-        with quietly(), Progress(None, "", bool(progress), what, stays=False):
+        with quietly(), Progress(None, "", bool(progress), what):
             outcome = outcome.marginal(is_within, has_halos, has_levels)
     for words in outcome.levels_in_words():
         detail("%s", words)

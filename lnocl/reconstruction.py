@@ -16,7 +16,6 @@ from lnocl.core.runs.held_out import HeldOutCounts
 from lnocl.core.runs.options import warn_of_rounding
 from lnocl.core.runs.outcome import Outcome
 from lnocl.core.runs.preparation import Prepared, quietly
-from lnocl.core.runs.progress import Progress
 from lnocl.core.runs.run import Run
 from lnocl.core.runs.start import Start, make_start
 from lnocl.core.runs.steady import run_steadily, told_prior
@@ -25,6 +24,7 @@ from lnocl.core.scene.noise_check import warn_of_noise
 from lnocl.core.scene.penalty import Penalty
 from lnocl.core.scene.star_check import warn_of_stars
 from lnocl.errors import DivergedError, NotFiniteError, warn
+from lnocl.progress import Progress
 from lnocl.result import Callback, Estimate, Iterating
 
 
@@ -56,7 +56,7 @@ def reconstruct(
     if setup.engine == "opencl" and setup.precision == "single":
         warn_of_rounding(n_iter)
     with quietly():
-        with Progress(None, "", bool(progress), "measuring steps", stays=False):
+        with Progress(None, "", bool(progress), "measuring steps"):
             start = make_start(setup, penalties[0])
             if setup.settles_halos:
                 from lnocl.core.runs.halos import settle_halos  # which loads scipy
@@ -103,7 +103,7 @@ def _choose(
 
 def _run_steadily(start: Start, penalty: Penalty, n_iter: int, progress: bool) -> Outcome | None:
     """Return that of `lnocl.core.runs.steady.run_steadily`; None where its objective rises."""
-    fitting = Progress(n_iter, "it", bool(progress), "fitting the stars", stays=False)
+    fitting = Progress(n_iter, "it", bool(progress), "fitting the stars")
     with fitting, suppress(DivergedError, NotFiniteError):  # of which the halves tell
         return run_steadily(start, penalty, n_iter, fitting.update)
     return None
@@ -155,7 +155,7 @@ def _iterate(
             stop_reason = "callback"
         if rule.met(run):
             stop_reason = rule.reason  # it would end here without a callback too
-        bar.show(iteration, quantity, last=stop_reason is not None or iteration == run.n_iter)
+        bar.show(iteration, quantity)
         if stop_reason is not None:
             break
         save("")

@@ -232,7 +232,7 @@ class Significance:
         from astropy.units import electron, pix
 
         from lnocl.core.runs.injections import APART, Injections, spread_places
-        from lnocl.core.runs.progress import Progress
+        from lnocl.progress import Progress
 
         check_injections(n, seed)
         limits, observation = self.limit(completeness), self._outcome.observation

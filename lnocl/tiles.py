@@ -17,7 +17,6 @@ from lnocl.core.runs.outcome import Outcome
 from lnocl.core.runs.plan import Plan
 from lnocl.core.runs.plan import plan as make_plan
 from lnocl.core.runs.preparation import Prepared, prepare
-from lnocl.core.runs.progress import Progress
 from lnocl.core.runs.start import Setup
 from lnocl.core.scene.arrays import Array, together, whole
 from lnocl.core.scene.counts import mean_exposure, means
@@ -29,6 +28,7 @@ from lnocl.core.scene.scene import Scene
 from lnocl.errors import InputError, LnoclWarning, counted, warn
 from lnocl.parallel import Parallel, check_parallel, work
 from lnocl.process import ignored_warnings, recorded_warnings
+from lnocl.progress import Progress
 from lnocl.reconstruction import reconstruct
 from lnocl.residuals import StarResiduals
 from lnocl.result import Result, make_result

@@ -9,6 +9,7 @@ import lnocl
 # Each room may import those above it in this list, never one of its own line or below.
 FLOORS = [
     {"errors", "process", "notebook", "loading"},
+    {"progress"},
     {"parallel"},
     {"scene"},
     {"metrics", "residuals", "io", "reference", "solvers", "opencl"},

@@ -15,6 +15,7 @@ import time
 import traceback
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
+from contextvars import copy_context
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -24,6 +25,7 @@ from lnocl.commands.parser import Command
 from lnocl.commands.signals import Terminated
 from lnocl.commands.targets import Target, read_targets
 from lnocl.errors import FileError, InputError, LnoclError, counted
+from lnocl.progress import HIDDEN, Progress
 from lnocl.residuals import MUCH_HALO
 from lnocl.result.verdict import FITS
 
@@ -195,7 +197,9 @@ def _do(folder: Folder, start: str, target: Target) -> Record:
         contextlib.redirect_stderr(log),
     ):
         try:
-            status = running.run({"deconvolve": deconvolve.COMMAND}, words)
+            context = copy_context()
+            context.run(HIDDEN.set, True)
+            status = context.run(running.run, {"deconvolve": deconvolve.COMMAND}, words)
         except Exception as error:  # which stops no other target
             status = 1
             log.write(f"{traceback.format_exc()}lnocl: error: {type(error).__name__}: {error}\n")
@@ -255,7 +259,6 @@ def _write_log(folder: Folder, record: Record, log: str) -> None:
 
 
 def _run(arguments: argparse.Namespace) -> Iterator[str]:
-    from lnocl.core.runs.progress import Progress
     from lnocl.io import atomic
     from lnocl.parallel import check_parallel
 

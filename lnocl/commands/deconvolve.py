@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING, Any
 from lnocl.commands import checkpoints, messages, options, pictures, record
 from lnocl.commands.deconvolve_options import ALL_OPTIONS, OPTIONS, PARAMETERS
 from lnocl.commands.parser import Command
-from lnocl.core.runs.progress import Progress
 from lnocl.deconvolution import deconvolve
 from lnocl.errors import InputError, MisfitWarning, detail, warn
+from lnocl.progress import Progress
 from lnocl.result import Callback, Result, view_of
 
 if TYPE_CHECKING:
@@ -128,7 +128,7 @@ def _answer(
     """Return what is said of a result, after what was recorded; log the details."""
     from lnocl.result.summary import Unit, details, summary_lines
 
-    with Progress(None, "", not arguments.quiet, "measuring errors", stays=False):
+    with Progress(None, "", not arguments.quiet, "measuring errors"):
         for line in details(result):
             detail("%s", line)
         name = re.sub(r"^(electron|photon)\b", r"\1s", frames.unit)

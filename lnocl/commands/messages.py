@@ -9,10 +9,11 @@ import re
 import sys
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from functools import partial
 from typing import Any, TextIO
 
-from lnocl.core.runs.progress import LOG as PROGRESS
 from lnocl.errors import LOG, LnoclWarning, with_names
+from lnocl.progress import LOG as PROGRESS
 
 # Rows of a table that are printed, unless more were asked for.
 MAX_LISTED = 12
@@ -32,8 +33,9 @@ def say(lines: Iterable[str]) -> None:
     """Write lines to stdout as they come; a reader that has left early is not an error."""
     for line in lines:
         try:
-            sys.stdout.write(_one_line(line, sys.stdout) + "\n")
-            sys.stdout.flush()
+            with _above_bars(sys.stdout):
+                sys.stdout.write(_one_line(line, sys.stdout) + "\n")
+                sys.stdout.flush()
         except OSError as error:
             # The rest of the buffer would fail again when the interpreter ends.
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
@@ -108,7 +110,7 @@ def recorded(flags: Mapping[str, str], shows: Callable[[Warning], bool]) -> Iter
 
 
 @contextlib.contextmanager
-def shown_log(level: int, flags: Mapping[str, str]) -> Iterator[None]:
+def shown_log(level: int, has_progress: bool, flags: Mapping[str, str]) -> Iterator[None]:
     """Show the notes that the library logs on stderr, with `in_shell`.
 
     At the level of information they come at the end, below the answer; that of debugging shows
@@ -118,15 +120,20 @@ def shown_log(level: int, flags: Mapping[str, str]) -> Iterator[None]:
     ----------
     level : int
         ``logging.INFO`` or ``logging.DEBUG``; ``logging.CRITICAL`` shows no notes.
+    has_progress : bool
+        Whether lines on progress are shown.
     flags : mapping of str to str
         As for `in_shell`.
     """
     held: list[str] = []
     show = held.append if level > logging.DEBUG else _note
+    # Commands in another one may write elsewhere; its own lines on progress go on.
+    progress = _Notes(flags, partial(_note, stream=sys.stderr), logging.INFO)
+    is_first = has_progress and not PROGRESS.handlers
     try:
         with (
             _handled(LOG, _Notes(flags, show, level), takes_place=True),
-            _handled(PROGRESS, _Notes(flags, _note, level), takes_place=True),
+            _handled(PROGRESS, progress) if is_first else contextlib.nullcontext(),
         ):
             yield
     finally:
@@ -158,12 +165,17 @@ def _without_likes(lines: Sequence[str]) -> Iterator[str]:
         yield f"{first}; {len(others)} more like this: --verbose" if others else first
 
 
-def _note(message: str) -> None:
+def _note(message: str, stream: TextIO | None = None) -> None:
+    stream = stream or sys.stderr
+    with contextlib.suppress(OSError), _above_bars(stream):
+        stream.write(_one_line(f"lnocl: {message}", stream) + "\n")
+        stream.flush()
+
+
+def _above_bars(stream: TextIO) -> contextlib.AbstractContextManager[object]:
+    """Return a context in which bars that are shown make place for what is written."""
     tqdm = sys.modules.get("tqdm")
-    above = tqdm.tqdm.external_write_mode(sys.stderr) if tqdm else contextlib.nullcontext()
-    with contextlib.suppress(OSError), above:  # of bars that are shown
-        sys.stderr.write(_one_line(f"lnocl: {message}", sys.stderr) + "\n")
-        sys.stderr.flush()
+    return tqdm.tqdm.external_write_mode(stream) if tqdm else contextlib.nullcontext()
 
 
 class _Notes(logging.Handler):

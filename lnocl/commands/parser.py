@@ -13,6 +13,7 @@ from lnocl.commands.messages import in_shell, shown_log
 from lnocl.commands.options import Option, Options
 from lnocl.errors import InputError
 from lnocl.io.names import file_of
+from lnocl.progress import Progress
 
 
 class Command(NamedTuple):
@@ -43,7 +44,9 @@ class Command(NamedTuple):
         level = logging.DEBUG if _is(arguments, "verbose") else logging.INFO
         if not hasattr(arguments, "quiet") or arguments.quiet:
             level = logging.CRITICAL
-        with shown_log(level, self.flags()):
+        is_shown = not (_is(arguments, "quiet") or _is(arguments, "no_progress"))
+        name = getattr(arguments, "command_name", "working")
+        with shown_log(level, is_shown, self.flags()), Progress(None, "", is_shown, name):
             for line in self.run(arguments):
                 if not _is(arguments, "quiet"):
                     yield line

@@ -66,7 +66,9 @@ def make_parser(commands: Mapping[str, Command]) -> Parser:
         "terminated.",
     )
     parser.add_argument("--version", action="version", version=f"lnocl {__version__}")
-    subparsers = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
+    subparsers = parser.add_subparsers(
+        title="commands", metavar="COMMAND", required=True, dest="command_name"
+    )
     for name, command in commands.items():
         subparser = subparsers.add_parser(name, help=command.summary, description=command.summary)
         command.add_arguments(subparser)

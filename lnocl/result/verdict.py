@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from lnocl.core.runs.progress import Progress
 from lnocl.core.scene.arrays import Array
 from lnocl.core.scene.detector import on_sky
 from lnocl.core.scene.star_psfs import owned
 from lnocl.core.scene.stars import MAX_SHIFT
 from lnocl.errors import MisfitWarning, counted, warn
+from lnocl.progress import Progress
 
 if TYPE_CHECKING:
     from lnocl.result import Result
@@ -37,7 +37,7 @@ def warn_of_faults(result: Result, progress: bool) -> None:
     """
     with (
         np.errstate(over="ignore", invalid="ignore"),
-        Progress(None, "", bool(progress), "measuring residuals", stays=False),
+        Progress(None, "", bool(progress), "measuring residuals"),
     ):
         found = faults(result)
     for line in found:

@@ -19,7 +19,7 @@ import lnocl
 from lnocl.commands import cli
 from lnocl.core.opencl import device
 from lnocl.core.opencl.tuning import candidates, chosen, describe_tuning
-from lnocl.core.runs.progress import Progress
+from lnocl.progress import Progress
 from lnocl.studies import tuning
 
 pytestmark = pytest.mark.usefixtures("command_folder")
@@ -103,7 +103,7 @@ class TestProcess:
     def test_a_library_s_bar_where_stderr_is_closed(self, monkeypatch):
         monkeypatch.setattr(sys, "stderr", None)
         with Progress(1, "it", True) as bar:
-            bar.show(1, lambda: "done", last=True)
+            bar.show(1, lambda: "done")
 
     @pytest.mark.parametrize(
         "command",

@@ -49,9 +49,7 @@ def run(*options, output="out.fits"):
 @pytest.mark.exhaustive
 def test_the_file_has_the_psfs_and_their_parameters(capsys):
     assert run("--refine-psfs", "shift", "jitter") == 0
-    assert (
-        "lnocl: PSFs refined, shift and jitter fitted: misfit " in capsys.readouterr().err
-    )
+    assert "lnocl: PSFs refined, shift and jitter fitted: misfit " in capsys.readouterr().err
     observation = lnocl.Observation(fits.getdata("image.fits"), PSF, background=40.0)
     options = {"engine": "numpy", "n_iter": 20, "stop": None, "refine_psfs": ["shift", "jitter"]}
     result = lnocl.deconvolve(observation, [STAR], **options)

@@ -128,7 +128,9 @@ def test_what_parameters_cannot_mend_is_left_and_said(caplog):
     assert not result.psf_refinement.is_accepted
     before, after = result.psf_refinement.misfit
     assert 2 < before == after
-    (said,) = re.findall("PSFs not changed: misfit (.+), refined (.+); noise has 1; too", caplog.text)
+    (said,) = re.findall(
+        "PSFs not changed: misfit (.+), refined (.+); noise has 1; too", caplog.text
+    )
     assert float(said[0]) == pytest.approx(before, rel=0.01)
     assert float(said[1]) < 0.9 * before
     np.testing.assert_array_equal(result.psfs, [PSF / PSF.sum()])

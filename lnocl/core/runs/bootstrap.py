@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from lnocl.core.runs.outcome import Outcome
-from lnocl.core.runs.progress import Progress
 from lnocl.core.runs.quantities import Part, Quantity, in_electrons, measure, quantities_of
 from lnocl.core.runs.replicas import Replica, Replicas
 from lnocl.core.scene.apertures import AMOUNT, FLUX, FWHM
@@ -21,6 +20,7 @@ from lnocl.core.scene.arrays import Array, whole
 from lnocl.core.scene.texture import resolution
 from lnocl.errors import InputError
 from lnocl.parallel import Parallel, work
+from lnocl.progress import Progress
 
 if TYPE_CHECKING:
     from astropy.table import QTable

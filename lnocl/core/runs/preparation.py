@@ -12,13 +12,13 @@ import numpy as np
 from lnocl.core.runs.options import StopName
 from lnocl.core.runs.outcome import Mended, PsfRefinement
 from lnocl.core.runs.plan import CORES, EXPOSURES, LEVELS, PSFS, RAYS, Plan
-from lnocl.core.runs.progress import Progress
 from lnocl.core.runs.start import Setup
 from lnocl.core.runs.steady import STEADY, steady_penalty
 from lnocl.core.scene.arrays import Array
 from lnocl.core.scene.observation import Observation
 from lnocl.core.scene.penalty import Penalty, recommend_smoothing
 from lnocl.errors import NotFiniteError, detail
+from lnocl.progress import Progress
 
 # Of the smoothing that is recommended, from which held-out counts choose besides none.
 MULTIPLES = (1.0, 3.0, 10.0)
@@ -82,7 +82,7 @@ def prepare(plan: Plan, progress: bool = False) -> Prepared:
     if plan.does(LEVELS):
         from lnocl.core.runs.halos import settle_levels  # which loads scipy
 
-        with quietly(), Progress(None, "", bool(progress), "fitting levels", stays=False):
+        with quietly(), Progress(None, "", bool(progress), "fitting levels"):
             setup = settle_levels(setup)
     mended = _judge_psfs(plan, setup, progress) if plan.judges_psfs else Mended(setup)
     is_auto, stop = plan.does(PSFS), plan.stop
@@ -124,7 +124,7 @@ def _judge_psfs(plan: Plan, setup: Setup, progress: bool) -> Mended:
     if setup.observation.psf_error and len(known):
         judged = replace(setup, observation=setup.observation.replace(psf_scatter=None))
     mended = Mended(judged)
-    judging = Progress(None, "it", bool(progress), "judging the PSFs", stays=False)
+    judging = Progress(None, "it", bool(progress), "judging the PSFs")
     with judging, suppress(NotFiniteError):  # of which the run itself tells
         runs = GuardedRuns(judged, judging.update)
         mended = mend(runs, plan.families, plan.moves, plan.is_asked)
