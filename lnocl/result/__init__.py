@@ -25,6 +25,7 @@ from lnocl.result.views import view_of
 
 if TYPE_CHECKING:
     from astropy.io import fits
+    from astropy.nddata import CCDData
     from astropy.table import QTable
     from matplotlib.figure import Figure
 
@@ -305,6 +306,7 @@ class Result(Measured):
             Header of the first image, or of another whose pixels are those of the sky. The
             keywords of the target and the observation are copied. So are its coordinates, by
             which stars get ``ra`` and ``dec``, unless all images are turned against the sky.
+            By default the coordinates are those of the images, where these are NDData or CCDData.
         overwrite : bool, optional
             Whether an existing file may be replaced.
 
@@ -337,6 +339,7 @@ class Result(Measured):
         atomic.check_fits_output(path, overwrite)
         cards = [] if header is None else observed_cards(header, header)
         is_upright = (self._observation.transforms[:, :, :2] == np.eye(2)).all(axis=(1, 2))
+        header = self._wcs_header() if header is None else header
         write_file(
             self,
             path,
@@ -345,6 +348,44 @@ class Result(Measured):
             cards=cards,
             messages=str(self).splitlines(),
         )
+
+    def to_ccddata(self) -> CCDData:
+        """Return the extended source as a CCDData of astropy.
+
+        Returns
+        -------
+        astropy.nddata.CCDData
+            With its unit, electrons, per second where exposures were given, and the coordinates of
+            the images, where these were NDData or CCDData; those of a finer sky are as fine.
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> from astropy.nddata import CCDData
+        >>> from astropy.wcs import WCS
+        >>> import lnocl
+        >>> wcs = WCS({"CTYPE1": "RA---TAN", "CTYPE2": "DEC--TAN", "CRVAL1": 65.0, "CRVAL2": 19.5})
+        >>> image = CCDData(np.full((8, 8), 4.0), unit="electron", wcs=wcs)
+        >>> observation = lnocl.Observation(image, np.ones((3, 3)))
+        >>> result = lnocl.deconvolve(observation, stop=None, n_iter=2, engine="numpy")
+        >>> sky = result.to_ccddata()
+        >>> sky.unit, sky.wcs.wcs.crval.tolist()
+        (Unit("electron"), [65.0, 19.5])
+        """
+        from astropy.nddata import CCDData
+
+        from lnocl.io.fitsread import wcs_cards
+        from lnocl.io.headers import finer_cards, make_wcs
+
+        header, wcs = self._wcs_header(), None
+        if header is not None:
+            wcs = make_wcs(finer_cards(wcs_cards(header), self._observation.oversample))
+        return CCDData(self.extended, unit=self._unit, wcs=wcs)
+
+    def _wcs_header(self) -> fits.Header | None:
+        """Return the coordinates of the images, where they came with them."""
+        wcs = self._observation.wcs
+        return None if wcs is None else wcs.celestial.to_header(relax=True)
 
     def _repr_html_(self) -> str:
         """Return a table for a notebook, with a thumbnail where matplotlib is there."""

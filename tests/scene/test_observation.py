@@ -921,3 +921,19 @@ def test_read_noise_is_added_to_no_array_of_the_caller(dtype):
     assert (images == 5.0).all()
     assert (found.images == 14.0).all()
     assert not np.shares_memory(lnocl.Observation(images, np.ones((3, 3))).images, images)
+
+
+def test_it_is_printed_as_given():
+    obs = lnocl.Observation(
+        np.full((2, 8, 10), 90.0), np.ones((3, 5)), background=[84.42, 86.0], read_noise=5.0,
+        epochs=[1, 2],
+    )  # fmt: skip
+    assert str(obs).splitlines() == [
+        "lnocl.Observation",
+        "images: 2 of 10 x 8 pixels",
+        "PSFs: 5 x 3 pixels",
+        "background: 84.42 to 86",
+        "read noise: 5",
+        "bad pixels: 0 %",
+        "epochs: 2",
+    ]

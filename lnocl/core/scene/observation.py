@@ -31,6 +31,7 @@ from lnocl.core.scene.psfs import (
     own,
     without_errors,
 )
+from lnocl.core.scene.quantities import coordinates
 from lnocl.core.scene.transforms import of_one_shape, shapes_of
 from lnocl.errors import InputError, counted
 from lnocl.notebook import html_card
@@ -209,6 +210,9 @@ class Observation:
         As given; n is 0 where they were not.
     star_places : ndarray of float64, shape (n, 2)
         As given.
+    wcs : astropy.wcs.WCS or None
+        The coordinates of the sky: those of the first image, an NDData or CCDData, whose pixels
+        the sky has.
 
     Raises
     ------
@@ -283,6 +287,7 @@ class Observation:
     oversample: int
     effective_psfs: bool
     geometry: Geometry
+    wcs: Any
 
     def __init__(
         self,
@@ -335,9 +340,10 @@ class Observation:
             if read.variances is not None:
                 self.read_noise = noise_beyond_counts(self, read)
             self.background = np.add(*together(self.background, self.read_noise**2))
-            images, added = together(self.images, self.read_noise**2)
-            is_own = not np.may_share_memory(images, read.values["images"])
-            self.images = np.add(images, added, out=images if is_own else None)
+            counts, added = together(self.images, self.read_noise**2)
+            is_own = not np.may_share_memory(counts, read.values["images"])
+            self.images = np.add(counts, added, out=counts if is_own else None)
+        self.wcs = self._wcs_of(images)
         self._closed()
 
     def __setattr__(self, name: str, value: object) -> None:
@@ -571,6 +577,7 @@ class Observation:
             "geometry": geometry,
             "star_places": self.star_places - (columns.start, rows.start),
             "transmission": self.transmission_of(rows, columns),
+            "wcs": None,
         }
         for name, field in FIELDS.items():
             if field.axes == "pixels" and (values := getattr(self, name)).ndim > 2:
@@ -594,6 +601,13 @@ class Observation:
         axes = zip((rows, columns), given.shape[1:], strict=True)
         y, x = (np.arange(q * at.start, q * at.stop).clip(0, n - 1) for at, n in axes)
         return np.broadcast_to(own(given)[:, y[:, None], x], (len(given), len(y), len(x)))
+
+    def _wcs_of(self, images: Any) -> Any:
+        """Return the WCS of an image that is neither moved nor turned against the sky."""
+        is_sky = (self.transforms == np.eye(2, 3)).all(axis=(1, 2))
+        # Of one array for all images it is that of each.
+        pairs = zip(coordinates(images), is_sky, strict=False)
+        return next((wcs for wcs, is_same in pairs if wcs is not None and is_same), None)
 
     def _with(self, changes: dict[str, Any]) -> Observation:
         """Return a copy with other attributes, which may still change."""
@@ -623,22 +637,34 @@ class Observation:
         """Bytes that its arrays take."""
         return sum(array.nbytes for array in {**self._arrays(), "psfs": own(self.psfs)}.values())
 
+    def __repr__(self) -> str:
+        """Return shapes, levels and noise as given, a line each."""
+        rows = {"lnocl.Observation": "", **self._rows()}
+        return "\n".join(f"{name}: {value}" if value else name for name, value in rows.items())
+
     def _repr_html_(self) -> str:
         """Return a table for a notebook, with a thumbnail of the first image."""
+        image = np.where(self.mask[0], np.nan, self.images[0])
+        return html_card("lnocl.Observation", self._rows(), image)
+
+    def _rows(self) -> dict[str, str]:
         ny, nx = self.shape
         rows = {
             "images": f"{self.n_images} of {nx} x {ny} pixels",
             "PSFs": f"{' x '.join(map(str, self.psfs.shape[:0:-1]))} pixels",
-            "background": _range(self.background),
-            "read noise": f"{_range(self.read_noise)}, its square in images and background",
+            "background": _range(np.subtract(*together(self.background, self.read_noise**2))),
+            "read noise": _range(self.read_noise),
             "bad pixels": f"{100 * self.mask.mean():.2g} %",
         }
         if (self.exposure != 1.0).any():
             rows["exposure"] = _range(self.exposure)
         if len(self.halos):
             rows["halos"] = f"{len(self.halos)}, fitted in each image"
-        image = np.where(self.mask[0], np.nan, self.images[0])
-        return html_card("lnocl.Observation", rows, image)
+        if self.n_epochs > 1:
+            rows["epochs"] = f"{self.n_epochs}"
+        if self.oversample > 1:
+            rows["sky"] = f"{self.oversample} pixels to one of the images along each axis"
+        return rows
 
 
 def _range(values: Array) -> str:

@@ -128,6 +128,12 @@ def is_nddata(values: Any) -> bool:
     return isinstance(values, NDData)
 
 
+def coordinates(values: Any) -> list[Any]:
+    """Return the WCS of each NDData of a sequence, or of one, as it is; None where it has none."""
+    several = values if isinstance(values, (list, tuple)) else [values]
+    return [each.wcs if is_nddata(each) else None for each in several]
+
+
 def _masked(name: str, values: Any) -> Any:
     data = np.ma.asanyarray(values.data)
     if values.mask is None:
