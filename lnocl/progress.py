@@ -33,7 +33,7 @@ class Progress:
         What a step is, in the singular; empty where none is counted.
     is_shown : bool
         Whether it is shown: by tqdm where stderr is a terminal or in a notebook, else by lines in
-        the log, the first at once and then one each minute, of the phase that began last.
+        the log, the first after 1.5 s and then one each minute, of the phase that began last.
     name : str, optional
         What is done.
 
@@ -51,6 +51,8 @@ class Progress:
         is_shown = is_shown and bool(sys.stderr) and not HIDDEN.get()
         self._bar = _bar(total, unit, name) if is_shown else None
         self._is_lines = self._bar is not None and self._bar.disable
+        # A notebook is drawn by its own thread alone. Later stderr may be another.
+        self._is_terminal = self._bar is not None and getattr(sys.stderr, "isatty", bool)()
         if self._bar is not None:
             _CLOCK.begin(self)
 
@@ -89,8 +91,10 @@ class Progress:
         """Show the time that has passed; return whether a line was due, and is in the log."""
         if self._is_lines and is_due:
             LOG.info(self._line())
-        elif self._bar is not None and sys.stderr.isatty():  # a notebook is drawn by its thread
+        elif self._is_terminal and self._bar is not None and self._unit:
             self._bar.refresh()
+        elif self._is_terminal and self._bar is not None:
+            self._bar.update(0)  # which shows it for the first time, after its delay
         return self._is_lines and is_due
 
     def _line(self) -> str:
@@ -157,4 +161,5 @@ def _bar(total: int | None, unit: str, name: str) -> Any:
         disable=False if is_notebook else None,
         leave=False,
         bar_format=clock,
+        delay=0.0 if unit else CLOCK_INTERVAL,
     )

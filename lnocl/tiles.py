@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lnocl.core.runs.options import StopName, check_observation
-from lnocl.core.runs.outcome import Outcome
+from lnocl.core.runs.outcome import Outcome, StarErrors
 from lnocl.core.runs.plan import Plan
 from lnocl.core.runs.plan import plan as make_plan
 from lnocl.core.runs.preparation import Prepared, prepare
@@ -51,7 +51,7 @@ TILE_DTYPE = np.dtype(
 )
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class TiledResult(Result):
     """The result of `lnocl.deconvolve_tiles`, put together from those of its tiles.
 
@@ -104,6 +104,8 @@ class _Found(NamedTuple):
         Which of all stars in each epoch are its own.
     stars : ndarray of float64, shape (k, 6)
         Positions, fluxes, and their errors, of these.
+    covariances : ndarray of float64, shape (k / n_epochs, n_epochs, n_epochs)
+        Of the fluxes of each of them.
     at_stars : list of StarResiduals
         How well the model fits at these.
     messages : list of str
@@ -116,6 +118,7 @@ class _Found(NamedTuple):
     flux: tuple[float, float]
     numbers: NDArray[np.intp]
     stars: Array
+    covariances: Array
     at_stars: list[StarResiduals]
     messages: list[str]
 
@@ -349,9 +352,10 @@ def _solve(prepared: Prepared, tile: Tile) -> _Found:
         _alone(result),
         (x.core.start, y.core.start, len(x.core), len(y.core), *result.history[-1]),
         np.array(list(outcome.models())),
-        Light(outcome.estimate).flux(within, errors[0]),
+        Light(outcome.estimate).flux(within, errors.fluxes),
         numbers,
-        np.column_stack([positions, result.star_fluxes, *errors])[own],
+        np.column_stack([positions, result.star_fluxes, errors.fluxes, errors.positions])[own],
+        errors.covariances[tile.own],
         [at_stars[s] for s in own],
         [
             f"{begins}: {getattr(each.message, 'message', each.message)}"
@@ -404,6 +408,8 @@ class _Mosaic:
         _, background = together(observation.images, observation.background)
         self._models = np.zeros(observation.images.shape) + background
         self._stars = np.zeros((len(self.given_positions), 6))
+        n = self.observation.n_epochs
+        self._covariances = np.zeros((len(self._stars) // n, n, n))
         self.found: list[_Found] = []
 
     def add(self, tile: Tile, found: _Found) -> None:
@@ -414,6 +420,8 @@ class _Mosaic:
         there = self._sky[:, first_y : first_y + len(sky), first_x : first_x + sky.shape[1]]
         there += weights * sky, weights
         self._stars[found.numbers] = found.stars
+        n = self.observation.n_epochs
+        self._covariances[found.numbers[::n] // n] = found.covariances
         self.add_models(tile, found.models)
         nothing = np.zeros(0)
         result = replace(found.result, extended=nothing)
@@ -462,9 +470,9 @@ class _Mosaic:
         """Yield the models of the images."""
         return iter(self._models)
 
-    def star_errors(self) -> tuple[Array, Array]:
-        """Return the standard errors of star fluxes and positions."""
-        return self._stars[:, 3], self._stars[:, 4:]
+    def star_errors(self) -> StarErrors:
+        """Return the errors of stars."""
+        return StarErrors(self._stars[:, 3], self._stars[:, 4:], self._covariances)
 
     def of_halos(self, fluxes: Array) -> Array:
         """Return the amounts of halos, which tiles do not have."""

@@ -600,7 +600,7 @@ def test_a_grid_of_psfs_is_taken_tile_by_tile(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     words = write_frame(*stpsf_file())
     assert cli.main([*words, "--tile", "80", "--pad", "4", "--residuals"]) == 0
-    assert "written to out.fits" in capsys.readouterr().out
+    assert "out.fits\n" in capsys.readouterr().out
     observation, stars = make_frame(n_stars=3)
     _, psfs = stpsf_file()
     nodes = [(0, 0), (N - 1, 0), (0, N - 1), (N - 1, N - 1)]

@@ -17,6 +17,7 @@ from lnocl.deconvolution import deconvolve
 from lnocl.errors import InputError, MisfitWarning, detail, warn
 from lnocl.progress import Progress
 from lnocl.result import Callback, Result, view_of
+from lnocl.result.summary import Unit, details, summary_lines
 
 if TYPE_CHECKING:
     from lnocl.core.scene.observation import Observation
@@ -110,7 +111,7 @@ def _run(arguments: argparse.Namespace) -> Iterator[str]:
         if arguments.plot is not None:
             from lnocl.plotting.result import draw_result
 
-            pictures.draw(arguments, draw_result(view_of(result)))
+            pictures.draw(arguments, draw_result(view_of(result, _unit(frames))))
         *lines, end = lines
         files = [each for each in (arguments.output, arguments.plot) if each is not None]
         yield from [*lines, f"{end}; {', '.join(files)}"]
@@ -122,18 +123,19 @@ def _is_shown(arguments: argparse.Namespace, warning: Warning) -> bool:
     return arguments.quiet or not isinstance(warning, MisfitWarning)
 
 
+def _unit(frames: Frames) -> Unit:
+    return Unit(re.sub(r"^(electron|photon)\b", r"\1s", frames.unit), frames.electrons)
+
+
 def _answer(
     arguments: argparse.Namespace, result: Result, frames: Frames, recorded: Sequence[str]
 ) -> list[str]:
     """Return what is said of a result, after what was recorded; log the details."""
-    from lnocl.result.summary import Unit, details, summary_lines
-
     with Progress(None, "", not arguments.quiet, "measuring errors"):
         for line in details(result):
             detail("%s", line)
-        name = re.sub(r"^(electron|photon)\b", r"\1s", frames.unit)
         is_warned = any(line.startswith("warning: ") for line in recorded)
-        lines = summary_lines(result, Unit(name, frames.electrons), is_warned)
+        lines = summary_lines(result, _unit(frames), is_warned)
         return [messages.in_shell(each, COMMAND.flags()) for each in lines]
 
 

@@ -62,6 +62,7 @@ def in_shell(message: str, flags: Mapping[str, str]) -> str:
         The flag of each parameter, such as ``--n-iter``. Others keep their name.
     """
     typed = with_names(message, lambda name: flags.get(name, name), first=1)
+    typed = re.sub(r"--([\w-]+) False\b", r"--no-\1", typed)
     return re.sub(r"(--[\w-]+)=", r"\1 ", typed)
 
 

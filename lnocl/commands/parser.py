@@ -46,10 +46,17 @@ class Command(NamedTuple):
             level = logging.CRITICAL
         is_shown = not (_is(arguments, "quiet") or _is(arguments, "no_progress"))
         name = getattr(arguments, "command_name", "working")
-        with shown_log(level, is_shown, self.flags()), Progress(None, "", is_shown, name):
-            for line in self.run(arguments):
-                if not _is(arguments, "quiet"):
+        with shown_log(level, is_shown, self.flags()):
+            lines = self._lines(arguments)
+            line: str | None = ""
+            while line is not None:
+                with Progress(None, "", is_shown, name):  # which is gone where a line is shown
+                    line = next(lines, None)
+                if line is not None and not _is(arguments, "quiet"):
                     yield line
+
+    def _lines(self, arguments: argparse.Namespace) -> Iterator[str]:
+        yield from self.run(arguments)  # which may do all its work before the first
 
     def add_arguments(self, parser: argparse.ArgumentParser) -> None:
         """Add its options to its parser."""

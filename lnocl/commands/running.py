@@ -40,8 +40,11 @@ def run(commands: Mapping[str, Command], words: Sequence[str]) -> int:
             parsed = make_parser(commands).parse_args(words)
             flags |= parsed.command.flags()
             parsed.command.refuse_ignored(parsed)
-            with kept(parsed.command.inputs(parsed)):
-                messages.say(parsed.command.carry_out(parsed))
+            with (
+                kept(parsed.command.inputs(parsed)),
+                contextlib.closing(parsed.command.carry_out(parsed)) as lines,
+            ):
+                messages.say(lines)
     except LnoclError as error:
         return messages.fail(messages.in_shell(error.message, flags), error.exit_status)
     except (MemoryError, RuntimeError) as error:

@@ -29,7 +29,7 @@ def read_mask(files: ImageFiles, exposure: Array | None) -> Mask:
     for j, share in enumerate(n_masked / n_pixels):
         if share > MUCH_MASKED:
             warn(
-                f"{100 * share:.0f} % of `images[{j}]` are masked: look at why, above; leave "
+                f"{100 * share:.0f} % of `images[{j}]` are masked: the notes say why; leave "
                 "`mask` out, or name flags that are no fault, as in `mask` dq:16, if they are "
                 "good"
             )

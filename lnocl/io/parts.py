@@ -58,6 +58,7 @@ PARTS = {
     "DOUBTFUL": Part(pixels="u1", place=SKY),
     "PLAN": Part(("step", "done")),
     "MESSAGES": Part(("message",)),
+    "EPOCHS": Part(("label",)),
     # One row: the outcome of the run, from which errors and detections begin.
     "ESTIMATE": Part(("digest",)),
     # What was measured, and regions; the standard error and bias of each pixel, and the share of

@@ -23,7 +23,7 @@ Columns = dict[str, NDArray[np.float64]]
 
 TABLES = "STARS", "HALOS", "HISTORY", "CURVE", "HELDOUT"
 CUBES = ("MODELS", "RESIDUALS")
-READ = *TABLES, *CUBES, "DOUBTFUL", "MESSAGES"
+READ = *TABLES, *CUBES, "DOUBTFUL", "MESSAGES", "EPOCHS"
 # Words of a shell with bytes that FITS does not allow, as `fitswrite.history_lines` writes them.
 QUOTED = re.compile(r"\$'((?:[^'\\]|\\.)*)'")
 
@@ -52,6 +52,8 @@ class SavedResult:
         The image ``DOUBTFUL``, where it is there.
     messages : list of str
         The table ``MESSAGES``: messages of the run.
+    epoch_labels : list of str
+        The table ``EPOCHS``: the labels of several epochs.
     """
 
     path: str
@@ -63,6 +65,7 @@ class SavedResult:
     turns: NDArray[np.float64] | None
     doubtful: NDArray[np.bool_] | None
     messages: list[str]
+    epoch_labels: list[str]
 
     @property
     def stars(self) -> list[tuple[float, float]]:
@@ -143,7 +146,8 @@ def read_result(path: str) -> SavedResult:
     cubes = {name: found[name] for name in CUBES} if {*CUBES} <= {*found} else {}
     doubtful = found["DOUBTFUL"] != 0 if "DOUBTFUL" in found else None
     oversample = number(path, header, "OVERSAMP") or 1.0
-    if fault := _fault(extended, tables, cubes, doubtful, oversample):
+    labels = found["EPOCHS"]["label"].tolist() if "EPOCHS" in found else []
+    if fault := _fault(extended, tables, cubes, doubtful, oversample, len(labels)):
         raise no_result(path, fault)
     cards = readable(parts[CUBES[-1]].header) if cubes else fits.Header()
     p = len(cubes["MODELS"]) if cubes else 0
@@ -163,6 +167,7 @@ def read_result(path: str) -> SavedResult:
         np.array(turns, float).reshape(p, 2, 2) if is_turned else None,
         doubtful,
         found["MESSAGES"]["message"].tolist() if "MESSAGES" in found else [],
+        labels,
     )
 
 
@@ -177,10 +182,14 @@ def _fault(
     cubes: dict[str, NDArray[np.float64]],
     doubtful: NDArray[np.bool_] | None,
     oversample: float,
+    n_labels: int,
 ) -> str:
     """Return why these are not the parts of a result; nothing where they are."""
     if "STARS" not in tables:
         return "there is no table STARS"
+    n_epochs = int(np.max(tables["STARS"].get("epoch", 0.0), initial=0.0)) + 1
+    if n_labels != n_epochs and (n_labels or n_epochs > 1):
+        return f"EPOCHS has {n_labels} labels of {n_epochs} epochs"
     if extended.ndim != 2:
         return "the image is a cube"
     if oversample not in OVERSAMPLES or any(n % oversample for n in extended.shape):

@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+import contextlib
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
+
+from lnocl.core.scene.arrays import Array
+from lnocl.plotting.figure import MOST_STARS, as_text, line_style
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-from lnocl.core.scene.arrays import Array
-from lnocl.plotting.figure import MOST_STARS, as_text, line_style
+# Labels of epochs that an axis has room for.
+MOST_LABELS = 8
 
 
 class LightCurves(NamedTuple):
@@ -19,38 +25,51 @@ class LightCurves(NamedTuple):
     Attributes
     ----------
     fluxes, errors : ndarray of float64, shape (n_stars, n_epochs)
-        And their standard errors. Both are NaN where no image of the epoch shows the star.
+        And the standard errors of their changes. Both are NaN where no image of the epoch shows the
+        star.
     unit : str
         Of both.
+    labels : sequence of str
+        Of the epochs: dates, numbers or other texts.
     """
 
     fluxes: Array
     errors: Array
     unit: str
+    labels: Sequence[str]
 
 
-def light_curves(fluxes: Array, errors: Array, epochs: Array, unit: str) -> LightCurves | None:
+def light_curves(
+    fluxes: Array, errors: Array, labels: Sequence[str], unit: str
+) -> LightCurves | None:
     """Return the light curves of a table of stars and epochs; None where it has one epoch."""
-    n_epochs = int(np.max(epochs, initial=0)) + 1
-    if n_epochs == 1:
+    n = len(labels)
+    if n <= 1:
         return None
-    return LightCurves(np.reshape(fluxes, (-1, n_epochs)), np.reshape(errors, (-1, n_epochs)), unit)
+    return LightCurves(np.reshape(fluxes, (-1, n)), np.reshape(errors, (-1, n)), unit, labels)
+
+
+def times(labels: Sequence[str]) -> NDArray[Any]:
+    """Return the places of epochs on an axis: numbers, such as MJD, dates, or else 0, 1, 2 ..."""
+    for kind in (np.float64, "datetime64[s]"):
+        with contextlib.suppress(ValueError):
+            found = np.array(labels).astype(kind)
+            if not (found != found).any():
+                return found
+    return np.arange(float(len(labels)))
 
 
 def draw(axis: Axes, curves: LightCurves) -> None:
-    """Draw the fluxes of the brightest stars over their mean, with their standard errors."""
-    from matplotlib.ticker import MaxNLocator
-
+    """Draw the fluxes of the brightest stars over their mean, with the errors of their changes."""
     is_seen = np.isfinite(curves.fluxes)
     means = np.where(is_seen, curves.fluxes, 0.0).sum(axis=1) / np.maximum(is_seen.sum(axis=1), 1)
     shown = np.sort(np.argsort(-means, kind="stable")[:MOST_STARS])
-    epochs = np.arange(curves.fluxes.shape[1])
+    epochs = times(curves.labels)
     for i, s in enumerate(shown[means[shown] > 0]):
         flux, error = curves.fluxes[s] / means[s], curves.errors[s] / means[s]
         style = line_style(i) | {"lw": 0.8, "marker": "o", "ms": 3}
         axis.errorbar(
-            # Errors side by side, where stars have the same flux.
-            epochs + 0.06 * (i - (len(shown) - 1) / 2.0),
+            epochs,
             flux,
             np.nan_to_num(error),
             capsize=2,
@@ -58,9 +77,24 @@ def draw(axis: Axes, curves: LightCurves) -> None:
             **style,
         )
     axis.set_title("light curves", fontsize=9)
-    axis.set_xlabel("epoch")
     axis.set_ylabel("flux / mean", fontsize=9)
-    axis.xaxis.set_major_locator(MaxNLocator(integer=True))
+    _mark(axis, epochs, curves.labels)
     if axis.containers:
-        axis.legend(fontsize=8)
+        axis.legend(fontsize=8, loc="center left", bbox_to_anchor=(1.0, 0.5))
     axis.grid(alpha=0.3)
+
+
+def _mark(axis: Axes, epochs: NDArray[Any], labels: Sequence[str]) -> None:
+    """Mark an axis with dates, numbers, or labels where they are few."""
+    from matplotlib.dates import AutoDateLocator, ConciseDateFormatter
+    from matplotlib.ticker import MaxNLocator
+
+    axis.set_xlabel("epoch")
+    if epochs.dtype.kind == "M":
+        locator = AutoDateLocator(maxticks=8)
+        axis.xaxis.set_major_locator(locator)
+        axis.xaxis.set_major_formatter(ConciseDateFormatter(locator))
+    elif epochs.tolist() == [*range(len(labels))] and len(labels) <= MOST_LABELS:
+        axis.set_xticks(epochs, [as_text(label) for label in labels])
+    else:
+        axis.xaxis.set_major_locator(MaxNLocator(8))

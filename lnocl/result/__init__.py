@@ -223,7 +223,8 @@ class Result(Measured):
             Columns ``x`` and ``y`` in pixels, 0-based, and ``flux`` and ``flux_error`` in
             electrons, per second where exposures were given. Where positions were refined, also
             ``x_error`` and ``y_error``. With several epochs each star has a row in each, and
-            ``epoch`` is its number: rows of one star are its light curve.
+            ``epoch`` is its number, ``epoch_label`` its label, and ``variation_error`` the error
+            of the flux less the star's mean: rows of one star are its light curve.
 
         Examples
         --------
@@ -251,6 +252,9 @@ class Result(Measured):
         columns["flux_error"] = self.star_flux_errors * unit
         if (n_epochs := self._observation.n_epochs) > 1:
             columns["epoch"] = np.arange(len(self.star_fluxes)) % n_epochs
+            labels = np.array(self._observation.epoch_labels)
+            columns["epoch_label"] = labels[columns["epoch"]]
+            columns["variation_error"] = self.star_variation_errors * unit
         return QTable(columns)
 
     def plot(self) -> Figure:

@@ -102,6 +102,8 @@ def write_file(
     steps = zip(*(line.split(": ", 1) for line in result.plan.splitlines()), strict=True)
     parts["PLAN"] = list(map(Column, ("step", "done"), steps))
     parts["MESSAGES"] = [Column("message", messages)] if messages else None
+    if observation.n_epochs > 1:
+        parts["EPOCHS"] = [Column("label", observation.epoch_labels)]
     outcome = result._findings
     if given is not None and isinstance(outcome, Outcome):
         # It is in memory more than once while it is written.
@@ -177,6 +179,9 @@ def _star_columns(
     if (n_epochs := result._observation.n_epochs) > 1:
         epochs = np.arange(len(positions)) % float(n_epochs)
         columns.append(Column("epoch", epochs, "", "number of the epoch, from 0 on"))
+        changes = result.star_variation_errors / electrons
+        comment = "standard error against the star's mean"
+        columns.append(Column("variation_error", changes, column_unit(unit), comment))
     if header is not None and sky.has_celestial(header):
         ra, dec = sky.to_sky(positions, header).T
         columns += [

@@ -7,7 +7,9 @@ from collections.abc import Callable, Iterable, Iterator
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, Protocol
 
-from lnocl.core.runs.outcome import Outcome
+import numpy as np
+
+from lnocl.core.runs.outcome import Outcome, StarErrors
 from lnocl.core.scene.arrays import Array
 from lnocl.core.scene.observation import Observation
 from lnocl.errors import InputError
@@ -48,8 +50,8 @@ class Findings(Protocol):
     def models(self) -> Iterator[Array]:
         """Yield the m_j, electrons per pixel, shape (ny, nx)."""
 
-    def star_errors(self) -> tuple[Array, Array]:
-        """Return the standard errors of the fluxes of stars and halos, and of positions."""
+    def star_errors(self) -> StarErrors:
+        """Return the errors of stars and halos."""
 
     def of_halos(self, fluxes: Array) -> Array:
         """Return those of fluxes that are of halos, electrons of each image, shape (n_halos, p)."""
@@ -97,7 +99,69 @@ class Measured:
         >>> bool(32 < result.star_flux_errors[0] < 100)
         True
         """
-        return self._star_errors[0][: len(self.star_fluxes)]
+        return self._star_errors.fluxes[: len(self.star_fluxes)]
+
+    @property
+    def star_flux_covariances(self) -> Array:
+        """Covariances of each star's fluxes in the epochs, electrons squared, shape (n, m, m).
+
+        n counts the stars that were given, m the epochs. The variances are the squares of
+        `star_flux_errors`. The light of a star that the extended source, or a level, may hold is
+        wrong in all epochs alike, so that changes between epochs have smaller errors. NaN where no
+        good pixel shows a star.
+
+        See Also
+        --------
+        lnocl.Result.star_variation_errors : Errors of the changes.
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> import lnocl
+        >>> y, x = np.indices((33, 33)) - 16
+        >>> psf = np.exp(-(x**2 + y**2) / 4)
+        >>> images = np.array([5 + flux * psf / psf.sum() for flux in (1000, 1200)])
+        >>> observation = lnocl.Observation(images, psf, epochs=["May", "June"])
+        >>> result = lnocl.deconvolve(observation, [(16, 16)], stop=None, n_iter=20, engine="numpy")
+        >>> result.star_flux_covariances.shape
+        (1, 2, 2)
+        >>> bool(result.star_flux_covariances[0, 0, 1] > 0)
+        True
+        """
+        return self._star_errors.covariances
+
+    @property
+    def star_variation_errors(self) -> Array:
+        r"""Standard errors of fluxes less their star's mean over the epochs, electrons, (n,).
+
+        With the covariances C of the m epochs that show a star, and P their deviations from the
+        mean, the variances are the diagonal of
+
+        .. math:: P C P, \quad P = 1 - 1 1^T / m.
+
+        With one epoch they are 0. With these errors the fluxes of a star that does not vary scatter
+        about their mean; `star_flux_errors` are those of each flux.
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> import lnocl
+        >>> y, x = np.indices((33, 33)) - 16
+        >>> psf = np.exp(-(x**2 + y**2) / 4)
+        >>> images = np.array([5 + flux * psf / psf.sum() for flux in (1000, 1200)])
+        >>> observation = lnocl.Observation(images, psf, epochs=["May", "June"])
+        >>> result = lnocl.deconvolve(observation, [(16, 16)], stop=None, n_iter=20, engine="numpy")
+        >>> bool((result.star_variation_errors < result.star_flux_errors).all())
+        True
+        """
+        found = []
+        for covariance in self.star_flux_covariances:
+            known = np.isfinite(np.diag(covariance))
+            deviations = np.where(known & known[:, None], np.eye(len(known)), 0.0)
+            deviations[np.ix_(known, known)] -= 1.0 / max(known.sum(), 1)
+            variances = np.diag(deviations @ np.nan_to_num(covariance) @ deviations.T)
+            found.append(np.where(known, np.sqrt(variances.clip(0.0)), np.nan))
+        return np.array(found).ravel()
 
     @property
     def halo_flux_errors(self) -> Array:
@@ -128,7 +192,7 @@ class Measured:
         >>> bool(190 < result.halo_flux_errors[0, 0] < 400)
         True
         """
-        return self._findings.of_halos(self._star_errors[0])
+        return self._findings.of_halos(self._star_errors.fluxes)
 
     @property
     def star_position_errors(self) -> Array:
@@ -153,10 +217,10 @@ class Measured:
         >>> abs(result.star_positions - 16).max() < 0.01, (result.star_position_errors < 0.1).all()
         (np.True_, np.True_)
         """
-        return self._star_errors[1]
+        return self._star_errors.positions
 
     @cached_property
-    def _star_errors(self) -> tuple[Array, Array]:
+    def _star_errors(self) -> StarErrors:
         errors = self._findings.star_errors()
         for each in errors:
             each.flags.writeable = False
@@ -187,7 +251,7 @@ class Measured:
         >>> bool(result.extended.sum() > 3 * error)
         True
         """
-        return self._findings.extended_flux(self._star_errors[0])
+        return self._findings.extended_flux(self._star_errors.fluxes)
 
     @property
     def _outcome(self) -> Outcome:

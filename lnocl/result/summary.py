@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from lnocl.core.scene.counts import means
 from lnocl.core.scene.stars import MAX_SHIFT
 from lnocl.errors import counted
-from lnocl.residuals import Fit, sharp_sources
+from lnocl.residuals import SIGNIFICANCE, Fit, sharp_sources
 from lnocl.result.verdict import in_words
 
 if TYPE_CHECKING:
@@ -25,6 +25,8 @@ MAX_LISTED, MAX_COLUMNS = 12, 4
 # The darkest share of the extended source, and how bright it may be, in standard deviations of a
 # pixel's noise.
 DARK_SHARE, FLOOR = 0.05, 0.5
+# Residuals are called noise so near to it, relatively.
+NOISE = 0.05
 # Of a star that is masked in all images, or in all of its epoch.
 NOT_SHOWN = "unknown, as no good pixel shows it"
 # Numbers from the first on, and those whose error is below the second, have an exponent.
@@ -104,7 +106,7 @@ def _aligned(rows: Sequence[tuple[str, str]]) -> list[str]:
     """Return labels and words in two columns, and numbers with their errors one below another."""
     found = [NUMBER.match(words) for _, words in rows]
     width = max(len(label) for label, _ in rows)
-    most = max(each.end() for each in found if each)
+    most = max((each.end() for each in found if each), default=0)
     return [
         f"{label:{width}}  {' ' * (most - number.end() if number else 0)}{words}".rstrip()
         for (label, words), number in zip(rows, found, strict=True)
@@ -133,37 +135,45 @@ def _star_rows(result: Result, unit: Unit) -> list[tuple[str, str]]:
     fluxes, errors = (np.reshape(each, (-1, n)) for each in stars[1:])
     for k, (place, flux, error) in enumerate(zip(stars[0], fluxes, errors, strict=True), 1):
         seen, words = np.isfinite(flux), NOT_SHOWN
-        if seen.any() and n == 1:
-            words = unit.flux(flux[0], error[0])
+        if seen.sum() == 1:
+            words = unit.flux(flux[seen][0], error[seen][0])
         elif seen.any():
-            ends = flux[seen].min(), flux[seen].max()
-            low, high = (with_error(each / unit.electrons, 0.0) for each in ends)
-            middle = float(f"{np.median(error[seen]) / unit.electrons:.2g}")
-            words = f"{low} to {high} {unit.name} in {seen.sum()} epochs, +- {middle:g} in each"
+            middle = float(np.median(error[seen]))
+            low, high = (
+                with_error(end(flux[seen]) / unit.electrons, middle / unit.electrons).split(" +- ")
+                for end in (np.min, np.max)
+            )
+            words = f"{low[0]} to {' +- '.join(high)} {unit.name} in {seen.sum()} epochs"
         shown.append((f"star {k} {_rounded(place)}", words))
     n_more = len(shown) - MAX_LISTED
     return shown if n_more <= 1 else [*shown[:MAX_LISTED], (f"{n_more} more stars", "in its table")]
 
 
 def _light_curves(result: Result, unit: Unit) -> list[str]:
-    """Return a table with a row for each epoch and a column for each star, if they are few."""
+    """Return a table with a row for each epoch and a column for each star, if they are few.
+
+    Errors of epochs are those of the changes; that of the mean holds what all epochs share.
+    """
     n = result._observation.n_epochs
     n_stars = len(result.star_fluxes) // n
     if not (1 < n <= MAX_LISTED and 0 < n_stars <= MAX_COLUMNS):
         return []
-    pairs = zip(result.star_fluxes, result.star_flux_errors, strict=True)
-    words = [with_error(flux / unit.electrons, error / unit.electrons) for flux, error in pairs]
-    heads = [f"star {k} {_rounded(place)}" for k, place in enumerate(result.star_positions[::n], 1)]
-    columns = [
-        ["epoch", *map(str, range(n))],
-        *([head, *words[k * n : (k + 1) * n]] for k, head in enumerate(heads)),
-    ]
+    columns = [["epoch", *result._observation.epoch_labels, "mean"]]
+    fluxes, errors = (
+        np.reshape(each, (n_stars, n)) / unit.electrons
+        for each in (result.star_fluxes, result.star_variation_errors)
+    )
+    of_means = np.sqrt(np.nanmean(result.star_flux_covariances, axis=(1, 2))) / unit.electrons
+    for k, place in enumerate(result.star_positions[::n]):
+        pairs = zip(fluxes[k], errors[k], strict=True)
+        mean = with_error(np.nanmean(fluxes[k]), of_means[k])
+        columns.append([f"star {k + 1} {_rounded(place)}", *(with_error(*x) for x in pairs), mean])
     widths = [max(map(len, column)) for column in columns]
     rows = [
         "  ".join(f"{cell:>{width}}" for cell, width in zip(row, widths, strict=True))
         for row in zip(*columns, strict=True)
     ]
-    rows[0] += f"  {unit.name}"
+    rows[0] += f"  {unit.name}, errors of epochs against the mean"
     return rows
 
 
@@ -176,10 +186,10 @@ def _trust(result: Result, unit: Unit, is_warned: bool) -> Iterator[str]:
         yield f"no: {first}"
         yield from others
     elif is_warned:
-        yield "yes, but see the warnings: residuals are noise"
+        yield f"yes, but see the warnings: {_residuals(result.fit())}"
     else:
         fits = ", the PSF fits" if np.isfinite(result.star_fluxes).any() else ""
-        yield f"yes: residuals are noise{fits}"
+        yield f"yes: {_residuals(result.fit())}{fits}"
     yield from _floor(result, unit)
     yield from _unnamed(result, unit)
     yield from _shortness(result)
@@ -187,6 +197,12 @@ def _trust(result: Result, unit: Unit, is_warned: bool) -> Iterator[str]:
 
 def _rounded(place: NDArray[np.float64]) -> str:
     return in_words(np.round(place, 2))
+
+
+def _residuals(fit: Fit) -> str:
+    if not fit.n_pixels or abs(fit.rms - 1.0) < max(NOISE, SIGNIFICANCE * fit.error):
+        return "residuals are noise"
+    return f"residuals are {fit.rms:.2f} times noise"
 
 
 def _end(result: Result) -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -52,8 +52,9 @@ def faults(result: Result) -> list[str]:
     star and host may exchange.
     """
     findings, at_stars, overall = result._findings, result.star_residuals(), result.fit()
-    n_epochs = findings.observation.n_epochs
-    unfitted, lit, dark, lost, paired = (_Told(n_epochs) for _ in range(5))
+    labels = findings.observation.epoch_labels
+    n_epochs = len(labels)
+    unfitted, lit, dark, lost, paired = (_Told(labels) for _ in range(5))
     for s, (place, given, flux, found) in enumerate(
         zip(
             result.star_positions, findings.given_positions, result.star_fluxes, at_stars,
@@ -122,8 +123,8 @@ def faults(result: Result) -> list[str]:
 class _Told:
     """What is told of stars, once of each, whatever epochs it is of."""
 
-    def __init__(self, n_epochs: int) -> None:
-        self._n_epochs = n_epochs
+    def __init__(self, epoch_labels: Sequence[str]) -> None:
+        self._labels = epoch_labels
         self._found: dict[int, list[tuple[int, str, str, float]]] = {}
 
     def __len__(self) -> int:
@@ -131,7 +132,7 @@ class _Told:
 
     def add(self, s: int, place: str, more: str = "", share: float = np.nan) -> None:
         """Add what is told of flux `s`: the star's place, more words, and a share of its light."""
-        star, epoch = divmod(s, self._n_epochs)
+        star, epoch = divmod(s, len(self._labels))
         self._found.setdefault(star, []).append((epoch, place, more, share))
 
     def count(self) -> str:
@@ -144,10 +145,11 @@ class _Told:
 
     def _of_star(self, found: list[tuple[int, str, str, float]]) -> str:
         epoch, place, more, _ = found[0]
-        when = f" in {counted(len(found), 'epoch')}" if len(found) > 1 else f" in epoch {epoch}"
+        n = len(found)
+        when = f" in {counted(n, 'epoch') if n > 1 else f'epoch {self._labels[epoch]}'}"
         ends = [f"{100 * end([share for *_, share in found]):.0f}" for end in (min, max)]
         shares = "" if ends[0] == "nan" else f", {' to '.join(dict.fromkeys(ends))} %"
-        return f"{place}{when * (self._n_epochs > 1)}{more}{shares}"
+        return f"{place}{when * (len(self._labels) > 1)}{more}{shares}"
 
 
 def in_words(place: Iterable[float]) -> str:

@@ -9,13 +9,15 @@ import numpy as np
 from lnocl.core.runs.outcome import mean_over_epochs
 from lnocl.plotting.light_curves import light_curves
 from lnocl.plotting.result import ResultView
+from lnocl.result.summary import Unit
 
 if TYPE_CHECKING:
     from lnocl.result import Result
 
 
-def view_of(result: Result) -> ResultView:
-    """Return the arrays and texts of the picture of a result."""
+def view_of(result: Result, unit: Unit | None = None) -> ResultView:
+    """Return the arrays and texts of the picture of a result, its light curves in a unit."""
+    unit = unit or Unit(result._unit)
     observation = result._observation
     models = result.models()
     return ResultView(
@@ -35,9 +37,9 @@ def view_of(result: Result) -> ResultView:
         unit=result._unit,
         oversample=observation.oversample,
         light_curves=light_curves(
-            result.star_fluxes,
-            result.star_flux_errors,
-            np.tile(np.arange(observation.n_epochs), len(result.star_fluxes)),
-            result._unit,
+            result.star_fluxes / unit.electrons,
+            result.star_variation_errors / unit.electrons,
+            observation.epoch_labels,
+            unit.name,
         ),
     )

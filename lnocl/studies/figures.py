@@ -189,8 +189,8 @@ def view_of(saved: SavedResult) -> ResultView:
         oversample=q,
         light_curves=light_curves(
             saved.star_fluxes,
-            table.get("flux_error", np.full(len(epochs), np.nan)),
-            epochs,
+            table.get("variation_error", np.full(len(epochs), np.nan)),
+            saved.epoch_labels,
             str(saved.header.get("BUNIT", "")),
         ),
     )

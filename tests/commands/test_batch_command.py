@@ -67,7 +67,7 @@ def test_each_target_is_what_its_command_gives(capsys):
     assert [each["n_iter"] for each in found.values()] == [3, 2]
     log = Path("out/one.log").read_text()
     assert log.startswith(f"$ cd {os.getcwd()}; {found['one']['command']}\n")
-    assert "3 iterations on numpy" in log
+    assert "\n3 iterations, all that were allowed; " in log
 
 
 def test_the_summary_says_what_was_found_and_whether_it_fits(capsys):

@@ -197,7 +197,7 @@ class TestDeconvolve:
         Path(name).write_bytes(Path("a.fits").read_bytes())
         options = ("--psf", "k1.fits", "--n-iter", "1", *PAPER, *NUMPY, f"-oout-{name}")
         assert cli.main(["deconvolve", *options, "--", name]) == 0
-        assert capsys.readouterr().out.count("\n") == 3
+        assert capsys.readouterr().out.count("\n") == 4
         first = fits.getdata(f"out-{name}")
         script = "\n".join(fits.getheader(f"out-{name}")["HISTORY"])
         os.unlink(f"out-{name}")

@@ -55,7 +55,7 @@ def last_line(capsys):
 IN_THE_END = [
     "lnocl.deconvolution.make_result",
     "lnocl.result.Result.models",
-    "lnocl.result.summary.summary_lines",
+    "lnocl.commands.deconvolve.summary_lines",
     "lnocl.result.file.write_result",
     "lnocl.io.atomic.os.fsync",
 ]

@@ -146,7 +146,7 @@ def test_photometry_and_noise(command_folder, capsys, make, kind):
     each, unit = make(kind)
     write_stpsf()
     options = ["--psf", "stpsf.fits", "--star", f"{AT[0]},{AT[1]}", "--residuals", *NUMPY]
-    options += ["-o", "o.fits"]
+    options += ["-o", "o.fits", "--verbose"]
     assert cli.main(["deconvolve", f"{kind}.fits", *options]) == 0
     said = capsys.readouterr().err
     if make is of_nircam:

@@ -61,7 +61,7 @@ def test_images_of_two_scales(frames, capsys):
     command = ["deconvolve", *frames, "--psf", "coarse_psf.fits", "sharp_psf.fits"]
     command += ["--mask", "coarse_bad.fits", "sharp_bad.fits", "--background", "auto"]
     command += ["--exposure", "LIGHT", "--align", "wcs", "--star", f"{STAR[0]},{STAR[1]}"]
-    command += ["--residuals", "--engine", "numpy", "-o", "out.fits"]
+    command += ["--residuals", "--engine", "numpy", "-o", "out.fits", "--verbose"]
     assert cli.main(command) == 0
     said = capsys.readouterr().err
     assert "the sky has the pixels of sharp.fits, the smallest: positions are in these" in said

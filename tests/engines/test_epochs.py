@@ -258,7 +258,7 @@ def test_held_out_counts_of_epochs_resume(tmp_path):
 @pytest.mark.filterwarnings("ignore::lnocl.LnoclWarning")
 def test_fluxes_of_nights_and_their_errors():
     """A star of six nights beside a second one on a common host: pulls of 8 seeds."""
-    rng, pulls = np.random.default_rng(9), []
+    rng, pulls, of_changes = np.random.default_rng(9), [], []
     y, x = np.indices((40, 40))
     v, u = np.indices((17, 17)) - 8
     psfs = np.array([gaussian(u, v, np.diag([2.0 + 0.2 * j, 2.4])) for j in range(6)])
@@ -276,10 +276,16 @@ def test_fluxes_of_nights_and_their_errors():
         given = lnocl.Observation(counts, psfs, background=20.0, epochs=range(6))
         result = lnocl.deconvolve(given, stars, engine="numpy")
         assert worst(result.star_fluxes, fluxes.ravel()) <= 0.05
-        pulls.append((result.star_fluxes - fluxes.ravel()) / result.star_flux_errors)
+        off = result.star_fluxes - fluxes.ravel()
+        pulls.append(off / result.star_flux_errors)
+        changes = off.reshape(2, 6) - off.reshape(2, 6).mean(axis=1, keepdims=True)
+        of_changes.append(changes.ravel() / result.star_variation_errors)
+        assert (result.star_variation_errors < result.star_flux_errors).all()
     # Errors of one run are of a common host, and so not independent.
     assert abs(np.mean(pulls)) <= 0.7
     assert 0.6 <= np.sqrt(np.mean(np.square(pulls))) <= 1.4
+    # Without the host, which epochs share, they are independent but for their mean.
+    assert 0.8 <= np.sqrt(np.mean(np.square(of_changes))) <= 1.2
     table = result.to_table()
     assert table["epoch"].tolist() == [0, 1, 2, 3, 4, 5] * 2
     assert table["x"].value.tolist() == np.repeat(stars[:, 0], 6).tolist()

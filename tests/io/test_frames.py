@@ -461,7 +461,7 @@ class TestMask:
         observe("1.fits", mask=["dq"])
         flags.ravel()[12] = 1
         save_with_dq("1.fits", IMAGES[0], flags)
-        with pytest.warns(LnoclWarning, match=r"^11 % of image 0 are masked: look at why, above"):
+        with pytest.warns(LnoclWarning, match=r"^11 % of image 0 are masked: the notes say why"):
             observe("1.fits", mask=["dq"])
 
     def test_dq_that_is_not_there_or_does_not_fit(self):

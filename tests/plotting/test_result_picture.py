@@ -125,19 +125,31 @@ def test_of_many_stars_the_brightest_are_enlarged():
     assert "6 brightest of 9 stars" in figure.subfigs[0].get_suptitle()
 
 
-def test_light_curves_are_below():
+@pytest.mark.parametrize(
+    ("labels", "places", "shown"),
+    [
+        (["60735.25", "60736", "60740"], [60735.25, 60736.0, 60740.0], None),
+        (["2025-03-01", "2025-03-02T12:00:00", "2025-04-01"], [20148.0, 20149.5, 20179.0], None),
+        (["first", "second", "third"], [0.0, 1.0, 2.0], ["first", "second", "third"]),
+        (["1", "nan", "3"], [0.0, 1.0, 2.0], ["1", "nan", "3"]),
+    ],
+)
+def test_light_curves_are_below(labels, places, shown):
     fluxes = np.array([[9.0, 11.0, 10.0], [0.0, 0.0, 0.0], [1.0, 2.0, 3.0]])
-    table = fluxes.ravel(), np.full(9, 0.5), np.tile(np.arange(3), 3)
-    curves = light_curves(*table, "electron")
+    curves = light_curves(fluxes.ravel(), np.full(9, 0.5), labels, "electron")
     axis = draw_result(make_view(p=1, light_curves=curves)).subfigs[-1].axes[0]
     assert axis.get_title() == "light curves"
     drawn = [container.lines[0].get_ydata() for container in axis.containers]
     np.testing.assert_allclose(drawn, [[0.9, 1.1, 1.0], [0.5, 1.0, 1.5]])  # one has no light
+    at = axis.xaxis.convert_units(axis.containers[0].lines[0].get_xdata())
+    np.testing.assert_allclose(at, places)
+    if shown:
+        assert [text.get_text() for text in axis.get_xticklabels()] == shown
     assert [text.get_text() for text in axis.get_legend().texts] == [
         "star 1, mean 10 electron",
         "star 3, mean 2 electron",
     ]
-    assert light_curves(np.ones(2), np.ones(2), np.zeros(2, int), "") is None
+    assert light_curves(np.ones(2), np.ones(2), ["0"], "") is None
 
 
 @pytest.mark.exhaustive

@@ -145,10 +145,9 @@ def test_python_and_the_shell_write_the_same(case):
         names = [hdu.name for hdu in one]
         assert [hdu.name for hdu in other if hdu.name not in OF_SHELL] == names
         for name in names:
-            n = len(one[name].data) if name == "MESSAGES" else None  # the shell has more of them
-            np.testing.assert_equal(one[name].data[:n], other[name].data[:n], name)
-            if n is not None:
+            if name == "MESSAGES":  # the shell has more of them, and names options
                 continue
+            np.testing.assert_equal(one[name].data, other[name].data, name)
             found, expected = cards(other[name].header), cards(one[name].header)
             of_command = {k for k in found if re.sub(r"\d+$", "", k) in words}
             assert {k: found[k] for k in found if k not in of_command - {*expected}} == expected

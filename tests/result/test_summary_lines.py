@@ -86,20 +86,29 @@ def test_epochs_of_few_stars_are_a_table():
     places = [(9.0, 12.0), (30.0, 8.0)]
     result, lines = lines_of(places, 3, epochs=["b", "a", "c"], mask=mask)
     assert lines[0].split("  ")[0] == "epoch"
-    assert lines[0].endswith("  electrons")
-    n = result.star_fluxes.reshape(2, 3)
-    for epoch in range(3):
-        assert lines[1 + epoch].split()[0] == str(epoch)
-        assert with_error(n[0, epoch], result.star_flux_errors[epoch]) in lines[1 + epoch]
+    assert lines[0].endswith("  electrons, errors of epochs against the mean")
+    fluxes = result.star_fluxes.reshape(2, 3)
+    for epoch, label in enumerate("abc"):
+        assert lines[1 + epoch].split()[0] == label
+        changes = with_error(fluxes[0, epoch], result.star_variation_errors[epoch])
+        assert changes in lines[1 + epoch]
     assert lines[1].endswith("unknown")  # epoch a, of the second image
-    assert len({len(line) for line in lines[1:4]}) == 1
+    means, covariances = np.nanmean(fluxes, axis=1), result.star_flux_covariances
+    errors = covariances[0].mean() ** 0.5, covariances[1, 1:, 1:].mean() ** 0.5
+    found = [each.strip() for each in lines[4].split("  ") if each.strip()]
+    assert found == ["mean", *map(with_error, means, errors)]
+    assert len({len(line) for line in lines[1:5]}) == 1
 
 
 def test_epochs_of_many_stars_are_ranges():
     places = [(4.0 + 7.0 * k, 8.0 + k) for k in range(5)]
     result, lines = lines_of(places, 2, epochs=[0, 1])
-    low, high = result.star_fluxes[:2]
-    assert re.search(rf"star 1 .* {low:.6g} to {high:.6g} electrons in 2 epochs, \+- ", lines[0])
+    error = np.median(result.star_flux_errors[:2])
+    low, high = (with_error(each, error) for each in result.star_fluxes[:2])
+    low = low.partition(" +- ")[0]
+    assert re.fullmatch(
+        rf"star 1 \(4, 8\) +{low} to {re.escape(high)} electrons in 2 epochs", lines[0]
+    )
 
 
 def test_a_star_that_no_pixel_shows_is_unknown():

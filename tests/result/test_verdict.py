@@ -97,7 +97,7 @@ def test_a_star_that_moved_as_far_as_stars_may_is_named_first(nameless):
             _findings=SimpleNamespace(
                 given_positions=np.array([given]),
                 may_free_pixels=True,
-                observation=SimpleNamespace(n_epochs=1, star_places=()),
+                observation=SimpleNamespace(n_epochs=1, epoch_labels=("0",), star_places=()),
             ),
         )
         return faults(result)
@@ -114,7 +114,7 @@ def test_a_star_counts_once_and_its_epochs_are_named(nameless):
     findings = SimpleNamespace(
         given_positions=places,
         may_free_pixels=False,
-        observation=SimpleNamespace(n_epochs=2, star_places=()),
+        observation=SimpleNamespace(n_epochs=2, epoch_labels=("May", "June"), star_places=()),
     )
     result = SimpleNamespace(
         star_positions=places, star_fluxes=np.array([5.0, np.nan, 6.0, 7.0]), psf_refinement=None,
@@ -122,13 +122,13 @@ def test_a_star_counts_once_and_its_epochs_are_named(nameless):
         fit=Fit, _findings=findings,
     )  # fmt: skip
     unfitted, lit, paired = faults(result)
-    places = "(10, 13) in epoch 0 (20, 9) in 2 epochs"
+    places = "(10, 13) in epoch May (20, 9) in 2 epochs"
     assert unfitted == f"the model does not fit at 2 of 2 stars, {places}: give a better PSF"
     assert lit.startswith("light lies all round 2 stars, as a share of its flux: (10, 13) in epoch")
     assert paired.startswith(
         "2 stars may exchange light with the extended source there, up to this"
     )
-    assert "(10, 13) in epoch 0, 18 %; (20, 9) in 2 epochs, 17 to 18 %" in paired
+    assert "(10, 13) in epoch May, 18 %; (20, 9) in 2 epochs, 17 to 18 %" in paired
 
 
 @pytest.mark.parametrize("more", [[], ["--quiet"]])

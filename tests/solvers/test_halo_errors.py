@@ -103,7 +103,7 @@ def test_errors_are_those_of_the_dense_matrix(seed, monkeypatch):
     monkeypatch.setattr(least_squares, "NEGLIGIBLE", 1e-7)
     scene, sky, fluxes, mean = an_estimate(seed=seed)
     deviations, change = dense(scene, sky, mean, True)
-    found = standard_errors(Estimate(scene, sky, fluxes), False)[:, 0]
+    found = standard_errors(Estimate(scene, sky, fluxes), False)[0][:, 0]
     np.testing.assert_allclose(found, np.hypot(deviations, change)[:2], rtol=1e-5)
     errors = halo_errors(Estimate(scene, sky, fluxes)).errors * scene.mean_exposure
     deviations, _ = dense(scene, sky, mean, False)
@@ -164,7 +164,7 @@ def test_what_lies_beyond_a_window_is_the_information_of_each_image():
 def test_a_halo_that_is_known_leaves_a_star_the_error_of_counts():
     """The halo that is nearly a star raises its error by much, the broad one hardly."""
     scene, sky, fluxes, _ = an_estimate()
-    found = standard_errors(Estimate(scene, sky, fluxes), False)[:, 0]
+    found = standard_errors(Estimate(scene, sky, fluxes), False)[0][:, 0]
     around = near_star.Surroundings(Estimate(scene, sky, fluxes), False)
     known = [near_star.NearStar(around, s, 1e-8).fit.variances([0])[0] ** 0.5 for s in (0, 1)]
     raised = found / (np.array(known) * scene.unit)
@@ -177,11 +177,11 @@ def test_a_window_and_what_lies_beyond_it_are_the_grid(monkeypatch, moves):
     """Broad halos are told from beyond the window, compact ones in it."""
     monkeypatch.setattr(near_star, "WINDOW", 4.0)
     scene, sky, fluxes, _ = an_estimate(sky=0.05 * SKY)
-    found = standard_errors(Estimate(scene, sky, fluxes), moves)
+    found = standard_errors(Estimate(scene, sky, fluxes), moves)[0]
     around = near_star.Surroundings(Estimate(scene, sky, fluxes), moves)
     assert near_star.window_round(around, 0)[0].shape != (N, N)
     monkeypatch.setattr(near_star, "WINDOW", 1000.0)
-    whole = standard_errors(Estimate(scene, sky, fluxes), moves)
+    whole = standard_errors(Estimate(scene, sky, fluxes), moves)[0]
     k = 3 if moves else 1
     assert abs(found[:, :k] / whole[:, :k] - 1.0).max() < 0.05
 

@@ -89,7 +89,7 @@ def nights(n_epochs, noise=0.5):
     return images, Blurred(n_epochs), 2 * n_epochs
 
 
-def dense_variances(images, field, k):
+def dense_covariance(images, field, k):
     """Return the variances of all parameters by the inverse of the whole information."""
     slopes = np.zeros((k, len(images), SIDE**2))
     for j, each in enumerate(images):
@@ -99,13 +99,17 @@ def dense_variances(images, field, k):
     weights = np.array([each.precision.ravel() for each in images])
     information = np.einsum("ajn,jn,bjn->ab", columns, weights, columns)
     information[k:, k:] += np.eye(SIDE**2)
-    return np.diag(np.linalg.inv(information))[:k]
+    return np.linalg.inv(information)[:k, :k]
 
 
 def test_variances_are_those_of_the_inverse_and_lack_no_more_than_is_said():
     images, field, k = nights(6)
-    expected = dense_variances(images, field, k)
-    found = LeastSquares(images, [field], np.zeros(k), 2000, 1e-12).variances(range(k))
+    whole = dense_covariance(images, field, k)
+    expected, fit = np.diag(whole), LeastSquares(images, [field], np.zeros(k), 2000, 1e-12)
+    found = fit.variances(range(k))
+    scales = np.sqrt(np.outer(expected, expected))
+    correlations = np.abs(fit.covariance(range(k)) - whole) / scales
+    assert correlations.max() < least_squares.MISSING
     lack = 1.0 - found / expected
     assert lack.min() > -1e-9
     assert 0.0 < lack.max() < least_squares.MISSING

@@ -141,7 +141,7 @@ def test_a_star_changes_with_a_level_as_its_error_says():
         observation = scene.observation.replace(background_error=np.broadcast_to(given, (2,)))
         there = Scene(observation, STARS, pad=8)
         known = Levels(Estimate(there, sky, FLUXES), are_fitted=False)
-        errors.append(standard_errors(Estimate(there, sky, FLUXES), False, levels=known)[:, 0])
+        errors.append(standard_errors(Estimate(there, sky, FLUXES), False, levels=known)[0][:, 0])
     for j in range(2):
         more = scene.observation.background + CHANGE * (np.arange(2) == j)
         higher = Scene(scene.observation.replace(background=more), STARS, pad=8)

@@ -291,8 +291,8 @@ class Outcome:
             if error > 0
         ]
 
-    def star_errors(self) -> tuple[Array, Array]:
-        """Return the standard errors of fluxes and positions, the extended source not known.
+    def star_errors(self) -> StarErrors:
+        """Return the errors of fluxes and positions, the extended source not known.
 
         Those of stars with PSFs of their own have how far they would be without it.
         Fluxes are those of stars and halos. `lnocl.core.solvers.star_errors` has the equation. Of
@@ -306,22 +306,41 @@ class Outcome:
             The images do not determine flux and position of a star, or the amount of a halo.
         """
         from lnocl.core.solvers.halos import halo_errors
-        from lnocl.core.solvers.star_errors import standard_errors, without_source
+        from lnocl.core.solvers.star_errors import add_apart, standard_errors, without_source
 
         scene, moves, halos = self.scene, self.moves, halo_errors(self.estimate)
         star_fluxes = self.star_fluxes[: scene.n_stars]
-        errors = standard_errors(self.estimate, moves, halos.raised, self.levels)
-        errors[:, 0] = np.hypot(errors[:, 0], without_source(self.estimate, halos.raised))
+        errors, covariances = standard_errors(self.estimate, moves, halos.raised, self.levels)
+        more = without_source(self.estimate, halos.raised)
         is_lost = np.isnan(errors[:, : 3 if moves else 1]).any(axis=1) & (star_fluxes > 0)
         _warn_of_undetermined(scene.stars[is_lost], bool(np.isnan(halos.errors).any()))
         if self.psf_refinement is not None:
             # Else what PSFs may have wrong is among the unknowns.
             left = self.psf_refinement.psf_error * (scene.observation.psf_error == 0)
             of_psfs = np.hypot(left, self.psf_refinement.hidden_error)
-            errors[:, 0] = np.hypot(errors[:, 0], of_psfs * star_fluxes)
+            more = np.hypot(more, of_psfs * star_fluxes)
+        errors, covariances = add_apart(errors, covariances, more)
         positions = errors[:, 1:]
         positions[positions > MAX_SHIFT] = np.nan  # no star is moved farther
-        return np.append(errors[:, 0], halos.errors), positions
+        return StarErrors(np.append(errors[:, 0], halos.errors), positions, covariances)
+
+
+class StarErrors(NamedTuple):
+    """Standard errors of stars.
+
+    Attributes
+    ----------
+    fluxes : ndarray of float64, shape (n_fluxes,)
+        Of stars, and then of halos, electrons.
+    positions : ndarray of float64, shape (n, 2)
+        Pixels; NaN where they were not fitted.
+    covariances : ndarray of float64, shape (n / n_epochs, n_epochs, n_epochs)
+        Of the fluxes of each star in its epochs, electrons squared.
+    """
+
+    fluxes: Array
+    positions: Array
+    covariances: Array
 
 
 def _warn_of_undetermined(stars: Array, are_halos: bool) -> None:

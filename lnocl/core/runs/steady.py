@@ -70,7 +70,7 @@ def told_prior(outcome: Outcome) -> StarPrior:
 
     scene, fluxes = outcome.scene, outcome.star_fluxes
     errors = np.full(len(fluxes), np.nan)
-    found = standard_errors(
+    found, _ = standard_errors(
         outcome.estimate, outcome.moves, levels=outcome.levels, finished=FINISHED
     )
     errors[: scene.n_stars] = found[:, 0]

@@ -213,7 +213,7 @@ def _deviations(field: Field, value: Any, held: Observation) -> Array:
 
 
 def _epochs(_: Field, epochs: Any, held: Observation) -> NDArray[np.intp]:
-    """Return the number of each image's epoch, in the order of the labels."""
+    """Return the number of each image's epoch, in the order of the labels, which are held too."""
     n_images = held.n_images
     labels, masked = values_and_mask("epochs", np.zeros(n_images) if epochs is None else epochs)
     refuse_masked("epochs", masked)
@@ -224,13 +224,14 @@ def _epochs(_: Field, epochs: Any, held: Observation) -> NDArray[np.intp]:
     if (labels != labels).any():
         raise InputError("`epochs` holds a label that is not a number; give one, or a name")
     try:
-        numbered = np.unique(labels, return_inverse=True)[1]
+        distinct, numbered = np.unique(labels, return_inverse=True)
     except TypeError:
         kinds = sorted({type(label).__name__ for label in labels.tolist()})
         raise InputError(
             f"`epochs` holds labels without an order, of {' and '.join(kinds)}; give numbers "
             "alone, or text alone"
         ) from None
+    held.epoch_labels = tuple(map(str, distinct.tolist()))
     return numbered.astype(np.intp)
 
 

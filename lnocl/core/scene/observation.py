@@ -196,6 +196,8 @@ class Observation:
         Of unit sum in each image, 0 where a pixel is bad; n is 0 where none were given.
     epochs : ndarray of int, shape (p,)
         The number of each image's epoch, from 0 on, in the order of the labels.
+    epoch_labels : tuple of str
+        The label of each epoch.
     oversample : int
         As given.
     effective_psfs : bool
@@ -279,6 +281,7 @@ class Observation:
     star_places: Array
     star_psfs: Array
     epochs: NDArray[np.intp]
+    epoch_labels: tuple[str, ...]
     background: Array
     background_error: Array
     read_noise: Array

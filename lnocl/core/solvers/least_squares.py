@@ -204,23 +204,31 @@ class LeastSquares:
         return change, self._each(x)
 
     def variances(self, unknowns: Sequence[int] | NDArray[np.int_]) -> Array:
-        """Return the variances of some parameters, with the others and the fields marginalised.
+        """Return the variances of some parameters, with the others and the fields marginalised."""
+        return self.covariance(unknowns).diagonal().copy()
 
-        They are too small by less than `MISSING` of them, or where `finished` or `n_steps` ends
-        conjugate gradients. One parameter has ``F^-1_ii + <w_i, S^-1 w_i>``, F the information,
-        w_i what the parameter does to the fields and S `_curvature`. The w_i of one star in many
+    def covariance(self, unknowns: Sequence[int] | NDArray[np.int_]) -> Array:
+        """Return the covariance of some parameters, with the others and the fields marginalised.
+
+        Variances are too small by less than `MISSING` of them, or where `finished` or `n_steps`
+        ends conjugate gradients. Parameters have ``F^-1_ij + <w_i, S^-1 w_j>``, F the information,
+        w_i what parameter i does to the fields and S `_curvature`. The w_i of one star in many
         epochs are much alike. So x with ``S x = w_i`` is found for one of them, and its part taken
-        from all: with ``<x, S x> = 1``, ``w_i -= <x, w_i> S x`` leaves ``<x, w_i>^2`` less of
-        ``<w_i, S^-1 w_i>``. No direction has less than 1 in S, so that ``|w_i|^2`` bounds the rest.
+        from all: with ``<x, S x> = 1``, ``w_i -= <x, w_i> S x`` leaves ``<x, w_i> <x, w_j>``
+        less of ``<w_i, S^-1 w_j>``. No direction has less than 1 in S, so that ``|w_i|^2`` bounds
+        the rest.
         """
         if not len(unknowns):
-            return np.zeros(0)
+            return np.zeros((0, 0))
         columns = [self.invert(unit) for unit in np.eye(len(self._prior))[unknowns]]
-        found = np.array([column[i] for column, i in zip(columns, unknowns, strict=True)])
+        found = np.array([column[unknowns] for column in columns])
         rests = np.array([self._adjoint(self._changes(column)) for column in columns])
         least = self._finished**2 * _sum("ik,ik->i", rests, rests)
         for _ in columns:
-            squares, enough = _sum("ik,ik->i", rests, rests), np.maximum(least, MISSING * found)
+            squares, enough = (
+                _sum("ik,ik->i", rests, rests),
+                np.maximum(least, MISSING * np.diag(found)),
+            )
             worst = int(np.argmax(squares / enough))
             if squares[worst] <= enough[worst]:
                 break
@@ -228,18 +236,18 @@ class LeastSquares:
             image = rests[worst] - left
             shares, square = _sum("ik,k->i", rests, x), float(_sum("i,i", x, image))
             rests -= shares[:, None] * (image / square)
-            found += shares**2 / square
+            found += np.outer(shares, shares) / square
         return found
 
-    def row(self, unknown: int) -> tuple[float, Array]:
-        """Return the variance of one parameter, and its change by each residual, (p, Ny, Nx)."""
+    def row(self, unknown: int) -> Array:
+        """Return the change of one parameter by each residual, shape (p, Ny, Nx)."""
         direct = self.invert(np.eye(len(self._prior))[unknown])
         seen = self._changes(direct)
         wanted = self._adjoint(seen)
         x = self._find_fields(wanted)
         of_fields = self._forward(x)
         seen += self._changes(self.invert(self.moments(of_fields))) - of_fields
-        return float(direct[unknown] + _sum("i,i", wanted, x)), self._precision * seen
+        return np.asarray(self._precision * seen)
 
     def _solve(self, pull: Array) -> tuple[Array, Array]:
         """Return the changes of the parameters, shape (k,), and of the fields, one after the other.

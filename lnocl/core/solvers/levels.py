@@ -157,18 +157,19 @@ class Levels:
                 dark, wings = self._held[j]
                 shapes = np.append(shapes, wings[None], axis=0)
                 beside[at] += np.einsum("iyx,yx,yx->i", shapes, dark, factors[j])
-        return self._product(shares, -2.0 * beside)
+        laid = self._laid(shares)
+        return float(laid @ self._covariance @ (laid - 2.0 * beside))
 
-    def variance_of(self, shares: Array) -> float:
-        """Return the variance of a sum of shares (p, 3) of the levels, scaled."""
-        return self._product(shares, np.zeros(len(self._covariance)))
+    def covariance_of(self, shares: Sequence[Array]) -> Array:
+        """Return the covariance of sums of shares (p, 3) of the levels, scaled."""
+        laid = np.array([self._laid(each) for each in shares])
+        return np.asarray(laid @ self._covariance @ laid.T)
 
-    def _product(self, shares: Array, more: Array) -> float:
-        """Return ``s^T C (s + x)``."""
+    def _laid(self, shares: Array) -> Array:
         laid = np.zeros(len(self._covariance))
         for j, at in self._places.items():
             laid[at[:3]] = shares[j]
-        return float(laid @ self._covariance @ (laid + more))
+        return laid
 
 
 def fit_levels(estimate: Estimate) -> Estimate:

@@ -42,7 +42,7 @@ def standard_errors(
     raised: Array | None = None,
     levels: Levels | None = None,
     finished: float = FINISHED,
-) -> Array:
+) -> tuple[Array, Array]:
     """Return the standard errors of stars, with halos and extended source marginalised.
 
     Parameters
@@ -60,23 +60,38 @@ def standard_errors(
 
     Returns
     -------
-    ndarray of float64, shape (n, 3)
+    errors : ndarray of float64, shape (n, 3)
         Of flux, electrons, x and y, pixels; NaN for positions that were not fitted, and where the
         images do not determine a star.
+    covariances : ndarray of float64, shape (n / n_epochs, n_epochs, n_epochs)
+        Of the fluxes of each star in its epochs, electrons squared; the variances are the squares
+        of the errors.
     """
     if raised is None:
         raised = halo_errors(estimate).raised
     scene, around = estimate.scene, Surroundings(estimate, moves, raised)
     errors = np.full((scene.n_stars, 3), np.nan)
     n_epochs, k = scene.observation.n_epochs, 3 if moves else 1
-    for first in range(0, scene.n_stars, n_epochs):  # which lies there in all epochs
-        near = NearStar(around, first, finished)
-        there = range(first, first + n_epochs)
-        errors[first : first + n_epochs, :k] = _errors_of(near, np.isin(near.held, there), levels)
+    covariances = np.full((scene.n_stars // n_epochs, n_epochs, n_epochs), np.nan)
+    for s, each in enumerate(covariances):  # a star, which lies there in all epochs
+        there = slice(s * n_epochs, (s + 1) * n_epochs)
+        near = NearStar(around, there.start, finished)
+        wanted = np.isin(near.held, range(there.start, there.stop))
+        errors[there, :k], each[...] = _errors_of(near, wanted, levels)
     errors[:, 0] *= scene.unit
     second_order = scene.observation.psf_error**2 * estimate.star_fluxes[: scene.n_stars]
-    errors[:, 0] = np.hypot(errors[:, 0], second_order)
-    return errors
+    return add_apart(errors, scene.unit**2 * covariances, second_order)
+
+
+def add_apart(errors: Array, covariances: Array, more: Array) -> tuple[Array, Array]:
+    """Return errors and covariances with errors of fluxes added that epochs do not share, (n,)."""
+    fluxes = np.hypot(errors[:, :1], more[:, None])
+    n = covariances.shape[-1]
+    variances = fluxes.reshape(-1, 1, n) ** 2
+    return (
+        np.concatenate([fluxes, errors[:, 1:]], axis=1),
+        np.where(np.eye(n, dtype=bool), variances, covariances),
+    )
 
 
 def without_source(estimate: Estimate, raised: Array) -> Array:
@@ -89,26 +104,34 @@ def without_source(estimate: Estimate, raised: Array) -> Array:
     for star in np.flatnonzero(scene.owned >= 0).tolist():
         near = NearStar(Surroundings(estimate, False, raised), star, FINISHED)
         seen = near.source.images_of(estimate.part(near.places(scene)))
-        found[star] = scene.unit * np.vdot(near.fit.row(int(near.unknowns[0, 0]))[1], seen)
+        found[star] = scene.unit * np.vdot(near.fit.row(int(near.unknowns[0, 0])), seen)
     return found
 
 
-def _errors_of(near: NearStar, wanted: NDArray[np.bool_], levels: Levels | None) -> Array:
-    """Return the errors of stars that are fitted, of their fluxes and perhaps x and y."""
+def _errors_of(
+    near: NearStar, wanted: NDArray[np.bool_], levels: Levels | None
+) -> tuple[Array, Array]:
+    """Return the errors of stars that are fitted, of their fluxes and perhaps x and y.
+
+    And the covariance of their fluxes.
+    """
     fit = near.fit
     unknowns = near.unknowns[wanted]
     is_determined = np.isfinite(variances(fit.information))
-    if not is_determined.any():
-        return np.full(unknowns.shape, np.nan)
-    change, _ = fit.solve()
     errors = np.full(unknowns.shape, np.nan)
+    covariance = np.full((len(unknowns),) * 2, np.nan)
+    if not is_determined.any():
+        return errors, covariance
+    change, _ = fit.solve()
     known = is_determined[unknowns]
     at, again = np.unique(unknowns[known], return_inverse=True)
-    if levels is None:
-        found = fit.variances(at)
-    else:
-        rows = (fit.row(i) for i in at.tolist())
-        shares = [(each, near.level_shares(by_residuals)) for each, by_residuals in rows]
-        found = np.array([each + levels.variance_of(share) for each, share in shares])
-    errors[known] = np.sqrt(found + change[at] ** 2)[again]
-    return errors
+    found = fit.covariance(at)
+    if levels is not None:
+        shares = [near.level_shares(fit.row(i)) for i in at.tolist()]
+        found = found + levels.covariance_of(shares)
+    found = found + np.outer(change[at], change[at])
+    errors[known] = np.sqrt(np.diag(found))[again]
+    of_flux = np.flatnonzero(known[:, 0])
+    places = np.searchsorted(at, unknowns[of_flux, 0])
+    covariance[np.ix_(of_flux, of_flux)] = found[np.ix_(places, places)]
+    return errors, covariance
