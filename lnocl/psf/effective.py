@@ -85,8 +85,9 @@ def combine(light: Array, bad: Mask, centres: list[Point], half: int, n_given: i
               {\sum_s c_s T_s^{-1} w}
 
     with the frame d above its background, the fluxes c, the translations T to the stars, and w,
-    0 at bad pixels and at neighbours that are not in the list. Those that are in it are
-    modelled. Each round fits flux and place of each star too.
+    0 at bad pixels and at sources that are not in the list. The sums over s are of the stars that
+    were given, or of all where one was given; t counts their neighbours too. Each round fits flux
+    and place of each star.
 
     Parameters
     ----------
@@ -99,7 +100,7 @@ def combine(light: Array, bad: Mask, centres: list[Point], half: int, n_given: i
     half : int
         The PSF reaches so many pixels from its middle.
     n_given : int
-        The mean place of the first so many stars stays.
+        The first so many stars are given; their mean place stays.
 
     Raises
     ------
@@ -173,6 +174,7 @@ class _Stars:
         self, light: Array, bad: Mask, centres: list[Point], half: int, n_given: int
     ) -> None:
         self._half, self._n_given, self._frame, self._bad = half, n_given, light, bad
+        self._n_own = n_given if n_given > 1 else len(centres)  # one star needs its neighbours
         self._repaired = np.pad(light, half)
         self._good = np.pad(~bad, half)
         self._light = np.where(self._good, self._repaired, 0.0)
@@ -193,6 +195,7 @@ class _Stars:
         """Return the PSF, its scatter and the stars."""
         side = 2 * self._half + 1
         shown = self._shown()
+        shown[self._n_own :] = 0.0
         weight = np.einsum("s,syx->yx", self._fluxes, shown)
         if not weight[self._half, self._half]:
             raise InputError(
@@ -218,20 +221,20 @@ class _Stars:
         return self._finished(psf, used)
 
     def _finished(self, psf: Array, shown: Array) -> EffectivePsf:
-        left, _ = self._residual(psf)
-        apart = np.array([self._centred(left, s) / c for s, c in enumerate(self._fluxes)])
+        (left, _), n = self._residual(psf), self._n_own
+        fluxes, shown = self._fluxes[:n], shown[:n]
+        apart = np.array([self._centred(left, s) / c for s, c in enumerate(fluxes)])
         core, error = psf > CORE * psf.max(), PSF_ERROR
-        if len(self._fluxes) > 1:
-            scatter = of_several(apart, shown, self._fluxes, psf, self._frame, self._bad)
-            error = width_error(apart, shown, self._fluxes, psf, core)
+        if n > 1:
+            scatter = of_several(apart, shown, fluxes, psf, self._frame, self._bad)
+            error = width_error(apart, shown, fluxes, psf, core)
         else:
-            (pixel,), (flux,) = self._pixels, self._fluxes
-            scatter = of_one(self._repaired, ~self._good, pixel, self._half) / flux
+            scatter = of_one(self._repaired, ~self._good, self._pixels[0], self._half) / fluxes[0]
         total, stars = psf.sum(), []
-        for s, (y, x) in enumerate(self._places - self._half):
+        for s, (y, x) in enumerate(self._places[:n] - self._half):
             parts = apart[s][core & (shown[s] > 0)]
             misfit = float(np.sqrt(np.mean(parts**2)) / psf.max()) if parts.size else np.nan
-            stars.append(FittedStar(float(x), float(y), float(self._fluxes[s] * total), misfit))
+            stars.append(FittedStar(float(x), float(y), float(fluxes[s] * total), misfit))
         return EffectivePsf(psf / total, scatter / total, error, stars, self._n_neighbours)
 
     def _shown(self) -> Array:

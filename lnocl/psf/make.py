@@ -248,8 +248,10 @@ def make_psf(
     explains all of them together. It has the noise of all stars together, and no blur by a shift,
     also where they are undersampled. Bad pixels are left to the other stars.
 
-    **Neighbours** are stars too: those not given that lie three widths or more from the given ones,
-    with a twentieth of the peak of one of them or more, are found in the crop and taken with them.
+    **Neighbours** are modelled with the PSF: stars not given that lie three widths or more from the
+    given ones, with a twentieth of the peak of one of them or more. Where several stars are given
+    these alone make the PSF, so that a star with something round it can be left out; where one is
+    given, its neighbours are taken with it.
     What the brightest given star, moved and scaled, does not explain is masked: galaxies, and stars
     too near to each other. So the PSF is the effective one wherever there are
     neighbours. This was measured with four stars of 3e4 to 2e5 electrons and FWHM 2.5. One had two

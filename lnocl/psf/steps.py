@@ -237,8 +237,9 @@ def find_neighbours(
             n_others += 1
     if not (stars or others):
         return [], far & False, []
+    use = "taken too" if len(centres) == 1 else "modelled beside them"
     line = (
-        f"neighbours: {counted(len(stars), 'star')} not given, taken too; "
+        f"neighbours: {counted(len(stars), 'star')} not given, {use}; "
         f"{counted(n_others, 'other source')} masked"
     )
     return stars, far | (distance(bad.shape, others) < MASKED * width), [line]

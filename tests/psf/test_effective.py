@@ -74,12 +74,27 @@ def test_neighbours_that_are_given_are_modelled():
     assert error(star, 2.5) < 2e-3
 
 
-@pytest.mark.parametrize("given", [PLACES, PLACES[0]])
-def test_other_neighbours_are_taken_too(given):
+@pytest.mark.parametrize(
+    ("given", "use"), [(PLACES, "modelled beside them"), (PLACES[0], "taken too")]
+)
+def test_other_neighbours_are_modelled(given, use):
     frame = a_frame(2.5, [*PLACES, (38.2, 33.4)], [*FLUXES, 0.2])
     star = make_psf(frame, given, SIZE, background=0.0)
     assert error(star, 2.5) < 4e-3
-    assert line(star, "neighbours").startswith("neighbours: 1 star not given, taken too; 0 ")
+    assert line(star, "neighbours").startswith(f"neighbours: 1 star not given, {use}; 0 ")
+
+
+def test_a_target_with_a_ring_that_is_not_given_is_no_part_of_the_psf():
+    """As it would be were it given."""
+    target = 44.3, 31.2
+    frame = a_frame(2.5, [*PLACES, target], [*FLUXES, 1.0])
+    turns = np.linspace(0.0, 2.0 * np.pi, 24, endpoint=False)
+    ring = [(target[0] + 4.0 * np.cos(t), target[1] + 4.0 * np.sin(t)) for t in turns]
+    frame += a_frame(2.5, ring, 0.02 * (1.0 + 0.5 * np.cos(turns)))
+    star = make_psf(frame, PLACES, SIZE, background=0.0)
+    assert line(star, "neighbours").startswith("neighbours: 1 star not given, modelled")
+    assert error(star, 2.5) < 2e-5
+    assert error(make_psf(frame, [*PLACES, target], SIZE, background=0.0), 2.5) > 4e-3
 
 
 def test_a_star_with_a_hole_beside_a_neighbour_is_refused():
