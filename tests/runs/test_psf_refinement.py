@@ -646,3 +646,28 @@ def test_what_could_refine_psfs_and_does_not_is_named(given, caplog):
     assert [line for line in caplog.messages if "no part" in line] == [
         f"{given} have no part in this run, which does not refine the PSFs by them"
     ]
+
+
+@pytest.mark.exhaustive
+def test_an_image_at_a_wrong_place_is_named_and_moves_no_star(caplog):
+    """By a third of a pixel, as of a wrong CRPIX; it moved the star by a third of that."""
+    caplog.set_level("INFO", "lnocl")
+    rng, (y, x) = np.random.default_rng(12), np.indices((48, 56))
+    star, wrong = (24.2, 20.6), np.array([(0.0, 0.0), (0.0, 0.0), (-0.27, 0.19)])
+    offsets = np.array([(0.0, 0.0), (2.0, 1.0), (-1.5, 0.5)])
+    widths = np.array([2.0, 2.3, 2.6])
+
+    def spot(u, v, w):
+        return np.exp(-(u**2 + 1.2 * v**2 + 0.3 * u * v) / w**2)
+
+    images, psfs, (v, u) = [], [], np.indices((25, 25)) - 12
+    for (dx, dy), w in zip(offsets + wrong, widths, strict=True):
+        light = spot(x - star[0] - dx, y - star[1] - dy, w)
+        images.append(rng.poisson(20.0 + 2e5 * light / light.sum()))
+        psfs.append(spot(u, v, w))
+    observation = lnocl.Observation(images, psfs, background=20.0, offsets=offsets, psf_error=0.03)
+    result = lnocl.deconvolve(observation, [(24.0, 21.0)], engine="numpy")
+    np.testing.assert_allclose(result.star_positions[0], star, atol=0.02)
+    (said,) = (each for each in caplog.messages if "pixels from its offset" in each)
+    assert said.startswith("image 2 was (-0.2")
+    assert result.psf_refinement.values[2, :2] == pytest.approx(wrong[2], abs=0.03)

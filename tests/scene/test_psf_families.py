@@ -147,7 +147,7 @@ def test_a_common_shift_is_taken_out():
     np.testing.assert_array_equal(none, (0.0, 0.0))
 
 
-@pytest.mark.parametrize("angles", [(0.0, 0.0, 0.0), (0.0, 70.0, 200.0)])
+@pytest.mark.parametrize("angles", [(0.0, 0.0, 0.0), (20.0, 70.0, 200.0)])
 def test_what_a_shift_of_the_sky_does_to_turned_images_is_none_of_their_psfs(angles):
     """The mean along the images' axes was taken for it, and moved stars where they are not."""
     maps = lnocl.rotations(angles, (7.5, 7.5))
@@ -159,3 +159,18 @@ def test_what_a_shift_of_the_sky_does_to_turned_images_is_none_of_their_psfs(ang
     found, common = families.without_common_shift(families.first()._replace(values=values))
     np.testing.assert_allclose(common, shift, rtol=1e-12)
     np.testing.assert_allclose(found.values, np.hstack([own, jitter]), atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    "maps", [{"offsets": [(0, 0), (3.5, -2.0), (0, 0)]}, {"angles": (0, 70, 0)}]
+)
+def test_it_is_that_of_the_images_whose_pixels_the_sky_has(maps):
+    """Not of those whose offsets may be wrong."""
+    if "angles" in maps:
+        maps = {"transforms": lnocl.rotations(maps["angles"], (7.5, 7.5))}
+    observation = lnocl.Observation(np.ones((3, 16, 16)), np.ones((5, 5)), **maps)
+    families = PsfFamilies(("shift",), observation)
+    values = np.array([(0.1, 0.2), (0.4, -0.3), (0.3, 0.0)])
+    found, common = families.without_common_shift(families.first()._replace(values=values))
+    np.testing.assert_allclose(common, (0.2, 0.1))
+    np.testing.assert_allclose(found.values, values - observation.turns @ common, atol=1e-12)

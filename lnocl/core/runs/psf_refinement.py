@@ -48,6 +48,8 @@ FADED = 0.5
 # Free pixels, which may fit anything, are to leave less than this share of kappa. Where it is not
 # significant they are tried above this kappa.
 FITTED, FREED = 0.3, 0.1
+# Images that lie farther from where their offsets have them, pixels, are named.
+MISPLACED = 0.1
 # Families that take a host, or a companion, for the PSF: unasked they are fitted beyond it alone.
 TAKING = "jitter", "pixels"
 # Rounds of a search: each takes so many steps, and judges the PSFs. It ends where a round lowers
@@ -191,6 +193,8 @@ def mend(runs: GuardedRuns, names: Sequence[str], moves: bool | str, is_asked: b
     if not (is_asked or len(known) or is_told):
         return Mended(changed, None, near_stars, True, True)
     _tell(given, state, tried, done)
+    if is_fitted and families.parameters[:2] == ["shift x", "shift y"]:
+        _tell_places(values[:, :2] / families.units[:2])
     refinement = PsfRefinement(
         tuple(families.parameters),
         values / families.units if is_fitted or not is_accepted else 0.0 * values,
@@ -387,6 +391,13 @@ def _tell_widths(observation: Observation, psfs: Psfs) -> None:
     if f"{max(widths):+.1f}" != words:
         words += f" to {max(widths):+.1f}"
     note(f"PSFs fitted to the stars: {words} % in width (`psf_error` 0 leaves them)")
+
+
+def _tell_places(shifts: Array) -> None:
+    """Say in a line for each image that lies elsewhere, by the shift of its PSF, in pixels."""
+    for j, (dx, dy) in enumerate(shifts):
+        if len(shifts) > 1 and np.hypot(dx, dy) > MISPLACED:
+            note(f"`images[{j}]` was ({dx:+.2f}, {dy:+.2f}) pixels from its offset, and is moved")
 
 
 def _tell(given: _State, state: _State, tried: _State, done: Sequence[str]) -> None:

@@ -110,6 +110,8 @@ class PsfFamilies:
     ) -> None:
         self._names, self._psfs = names, observation.psfs
         self._over_images, self._turns = observation.psfs_over_images, observation.turns
+        is_sky = (observation.transforms == np.eye(2, 3)).all(axis=(1, 2))
+        self._is_sky = is_sky if is_sky.any() else ~is_sky
         self._ideals, modes = observation.ideal_psfs, observation.psf_modes
         self._pupils = [Pupil(each) for each in observation.pupils] if "pupil" in names else []
         if "modes" not in names:
@@ -179,11 +181,16 @@ class PsfFamilies:
         return mapped(psfs, change)
 
     def without_common_shift(self, parameters: PsfParameters) -> tuple[PsfParameters, Array]:
-        """Return parameters without what a shift of the sky does alike, and that shift, (x, y)."""
+        """Return parameters without what a shift of the sky does alike, and that shift, (x, y).
+
+        It is that of the images whose pixels are the sky's, in which positions are, where there are
+        any: others may have wrong offsets.
+        """
         common, values = np.zeros(2), parameters.values
         if "shift" in self._names:
             shifts, turns = values[:, :2], self._turns
-            common[:] = np.linalg.lstsq(turns.reshape(-1, 2), shifts.ravel())[0]
+            of_sky = turns[self._is_sky].reshape(-1, 2), shifts[self._is_sky].ravel()
+            common[:] = np.linalg.lstsq(*of_sky)[0]
             values = np.hstack([shifts - turns @ common, values[:, 2:]])
         return parameters._replace(values=values), common
 
