@@ -42,7 +42,7 @@ _WITHOUT_GUARD = (
 
 
 def check_parallel(parallel: object) -> None:
-    """Refuse what says nothing of processes, and processes without Dask.
+    """Raise unless `parallel` is a flag, a number of processes or a scheduler, and Dask is there.
 
     Parameters
     ----------

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from lnocl.core.scene.arrays import Array
 from lnocl.core.scene.cores import fwhm
-from lnocl.core.scene.detector import on_sky, seen_psfs
+from lnocl.core.scene.detector import on_sky, psfs_on_detector
 from lnocl.core.scene.estimate import Estimate
 from lnocl.core.scene.observation import Observation
 
@@ -232,8 +232,10 @@ def judge_stars(estimate: Estimate) -> list[StarResiduals]:
     """
     found, scene = [], estimate.scene
     width = min(fwhm(psf) for psf in scene.observation.psfs) if scene.n_stars else 0.0
-    psfs = [seen_psfs(scene.observation, each) for each in scene.observation.star_psfs]
-    psfs += [seen_psfs(scene.observation)] if scene.n_stars else []  # the last, of all others
+    psfs = [psfs_on_detector(scene.observation, each) for each in scene.observation.star_psfs]
+    psfs += (
+        [psfs_on_detector(scene.observation)] if scene.n_stars else []
+    )  # the last, of all others
     on_pixels = on_sky(scene.stars, scene.oversample)
     n = scene.n_stars
     stars = zip(scene.stars, on_pixels, estimate.star_fluxes[:n], scene.shown[:n], strict=True)

@@ -174,7 +174,9 @@ class Significance:
         completeness = in_unit("completeness", completeness, "")
         number_in("completeness", completeness, "between 0 and 1", lambda given: 0 < given < 1)
         found, outcome = self._map, self._outcome
-        fluxes = np.maximum(found.needed(self._at_threshold, completeness), self._told_from_source)
+        fluxes = np.maximum(
+            found.needed(self._at_threshold, completeness), self._flux_distinct_from_source
+        )
         least = max(self.threshold, SIGNIFICANT) + norm.ppf(completeness)
         fluxes = np.maximum(fluxes, least * self._beside_psfs)
         ny, nx = outcome.observation.sky_shape
@@ -269,7 +271,7 @@ class Significance:
         return self._map.values_at(self.threshold)
 
     @cached_property
-    def _told_from_source(self) -> Array:
+    def _flux_distinct_from_source(self) -> Array:
         """The flux of a point that is told from the extended source, where there is any.
 
         That varies by as much as `lnocl.core.scene.texture` expects of the brightest round a star.
@@ -438,7 +440,7 @@ def _plain(table: QTable) -> dict[str, Array]:
 
 
 def check_search(width: object, false_alarms: object) -> None:
-    """Refuse a width that is none, and a number of false alarms that no threshold has.
+    """Raise unless the width is finite and not negative, and a threshold has the false alarms.
 
     Raises
     ------

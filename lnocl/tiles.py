@@ -474,7 +474,7 @@ class _Mosaic:
         """Return the errors of stars."""
         return StarErrors(self._stars[:, 3], self._stars[:, 4:], self._covariances)
 
-    def of_halos(self, fluxes: Array) -> Array:
+    def halo_amounts(self, fluxes: Array) -> Array:
         """Return the amounts of halos, which tiles do not have."""
         return np.zeros((0, self.observation.n_images))
 

@@ -110,7 +110,7 @@ class TestWrite:
             np.testing.assert_array_equal(models, result.models().astype("f4"))
             np.testing.assert_array_equal(residuals, result.residuals().astype("f4"))
 
-    @pytest.mark.filterwarnings("ignore:psf 0 is sharper than its pixels")
+    @pytest.mark.filterwarnings("ignore:psf 0 is undersampled")
     def test_errors_of_refined_stars_are_columns(self, tmp_path):
         from astropy.table import Table
 

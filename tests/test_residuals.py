@@ -13,7 +13,7 @@ from lnocl.core.scene.shifting import place
 from lnocl.residuals import CORE, WINGS, Fit, _halo, judge, judge_stars, residuals, sharp_sources
 
 # The PSFs are cut off.
-pytestmark = pytest.mark.filterwarnings("ignore:psf . is sharper than its pixels")
+pytestmark = pytest.mark.filterwarnings("ignore:psf . is undersampled")
 
 SHAPE = (24, 32)
 STARS = np.array([(20.3, 9.8), (1.0, 22.0)])

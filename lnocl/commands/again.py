@@ -28,7 +28,7 @@ SAME, ROUNDING = 1e-3, 1e-5
 
 
 @dataclass(frozen=True)
-class Again:
+class RerunOfFile:
     """A result in a file, and what its run was made of.
 
     Attributes
@@ -49,7 +49,7 @@ class Again:
     given: Any
 
     @classmethod
-    def read(cls, path: str, quiet: bool, check: Callable[[], object] = int) -> Again:
+    def read(cls, path: str, quiet: bool, check: Callable[[], object] = int) -> RerunOfFile:
         """Read a result and its images; before these, check what is to be written.
 
         Raises

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from lnocl.commands import options, pictures
-from lnocl.commands.again import Again
+from lnocl.commands.again import RerunOfFile
 from lnocl.commands.declared import parameter
 from lnocl.commands.messages import MAX_LISTED
 from lnocl.commands.parser import Command
@@ -45,10 +45,10 @@ def _run(arguments: argparse.Namespace) -> list[str]:
     table, unit = in_unit(found.detections, again.frames), again.frames.unit
     parts = {"DETECTIONS": table, "SIGNAL": found.signal_to_noise}
     add_parts(again.saved, parts, cards(found, unit), unit)
-    return finish(arguments, found, table, "detections", _told(found, table))
+    return finish(arguments, found, table, "detections", _summary_lines(found, table))
 
 
-def find(arguments: argparse.Namespace, content: str) -> tuple[Significance, Again]:
+def find(arguments: argparse.Namespace, content: str) -> tuple[Significance, RerunOfFile]:
     """Return the significance of sources in a result, and what its run was made of."""
     from lnocl.io import atomic, tables
     from lnocl.significance import check_search, significance
@@ -62,7 +62,7 @@ def find(arguments: argparse.Namespace, content: str) -> tuple[Significance, Aga
         pictures.check(arguments)
 
     check()  # before the result is read; then that nothing that it was made of is replaced
-    again = Again.read(arguments.result, arguments.quiet, check)
+    again = RerunOfFile.read(arguments.result, arguments.quiet, check)
     outcome = again.outcome()
     with ignored_notes():
         return significance(outcome, arguments.width, arguments.false_alarms), again
@@ -120,7 +120,7 @@ def finish(
     return said
 
 
-def _told(found: Significance, table: QTable) -> list[str]:
+def _summary_lines(found: Significance, table: QTable) -> list[str]:
     """Return a line for the field and one for each of the most significant detections."""
     what = f"source {found.width:g} pixels wide" if found.width else "point"
     lines = [

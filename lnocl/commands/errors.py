@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from lnocl.commands import options
-from lnocl.commands.again import Again
+from lnocl.commands.again import RerunOfFile
 from lnocl.commands.declared import parameter
 from lnocl.commands.messages import MAX_LISTED
 from lnocl.commands.options import option
@@ -64,7 +64,7 @@ def _run(arguments: argparse.Namespace) -> list[str]:
 
     check_parallel(arguments.parallel)
     check_number(arguments.bootstrap, arguments.seed)
-    again = Again.read(arguments.result, arguments.quiet)
+    again = RerunOfFile.read(arguments.result, arguments.quiet)
     parts = _parts(arguments, again.frames)
     if not arguments.overwrite:
         _check_seed(arguments.result, arguments.seed)
@@ -92,7 +92,7 @@ def _parts(arguments: argparse.Namespace, frames: Frames) -> list[Part]:
 def _add_errors(
     arguments: argparse.Namespace,
     outcome: Outcome,
-    again: Again,
+    again: RerunOfFile,
     parts: Sequence[Part],
 ) -> list[str]:
     """Add the errors of a result to its file, as replicas are done; return what to say of them.
@@ -103,7 +103,7 @@ def _add_errors(
         Those of ``lnocl errors``.
     outcome : Outcome
         What the run has found.
-    again : Again
+    again : RerunOfFile
         The file, and what its result was made of.
     parts : list of Aperture or Profile
         Regions and profiles that are measured.
@@ -180,7 +180,9 @@ def _held(found: Bootstrap, frames: Frames) -> Held:
     return Held(names, values, found.errors, found.of_psfs, found.sums, found.seed)
 
 
-def _write(again: Again, found: Bootstrap, parts: Sequence[Part], before: Held | None) -> None:
+def _write(
+    again: RerunOfFile, found: Bootstrap, parts: Sequence[Part], before: Held | None
+) -> None:
     from lnocl.io.fitserrors import write_errors
 
     frames = again.frames

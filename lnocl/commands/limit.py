@@ -63,13 +63,13 @@ def _run(arguments: argparse.Namespace) -> list[str]:
     maps = {f"LIMIT{each}": found.limit(each / 100) / frames.electrons for each in COMPLETENESS}
     cards = detect.cards(found, frames.unit)
     add_parts(again.saved, {"LIMITS": table, **maps}, cards, frames.unit)
-    lines = _told(found, table, maps["LIMIT50"], frames.unit)
+    lines = _summary_lines(found, table, maps["LIMIT50"], frames.unit)
     with ignored_notes():
         lines += _checked(found, arguments)
     return detect.finish(arguments, found, table, "limits", lines, curves)
 
 
-def _told(found: Significance, table: QTable, limit: np.ndarray, unit: str) -> list[str]:
+def _summary_lines(found: Significance, table: QTable, limit: np.ndarray, unit: str) -> list[str]:
     """Return a line for the whole field, and one for each star."""
     what = f"source {found.width:g} pixels wide" if found.width else "point"
     lines = [

@@ -75,7 +75,7 @@ def _run(arguments: argparse.Namespace) -> list[str]:
     for name in ("peak", "significance", "width"):
         stars[name].format = ".5g"
     tables.write_table(stars, arguments.output, "stars", arguments.overwrite)
-    lines = [*_told(stars, n_extended, n_sharp), f"written to {arguments.output}"]
+    lines = [*_summary_lines(stars, n_extended, n_sharp), f"written to {arguments.output}"]
     if arguments.plot is not None:
         from lnocl.plotting.stars import draw_stars
 
@@ -91,7 +91,7 @@ def _mask(arguments: argparse.Namespace) -> Mask | None:
     return masks.mask_of(arguments.image, word)[0] if word else None
 
 
-def _told(stars: Table, n_extended: int, n_sharp: int) -> list[str]:
+def _summary_lines(stars: Table, n_extended: int, n_sharp: int) -> list[str]:
     """Return how many stars there are, how many sources were left out, and which are saturated."""
     n = len(stars)
     wider = f"{counted(n_extended, 'source')} wider than the PSF left out"

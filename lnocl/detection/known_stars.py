@@ -1,4 +1,4 @@
-"""What the stars of a model have in common with a source at each place of the sky."""
+"""Information between the stars' parameters and a test source at each place of the sky."""
 
 from __future__ import annotations
 
@@ -91,7 +91,7 @@ class KnownStars:
         width: float,
         resolution: float,
     ) -> Shared:
-        """Return what they share with a source.
+        """Return the information that their parameters share with a source.
 
         Parameters
         ----------

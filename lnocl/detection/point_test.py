@@ -1,4 +1,4 @@
-r"""Whether the extended source could be what a place holds, by the least squares of a point there.
+r"""Test whether a detection is a point or part of the extended source, by least squares.
 
 A point takes the place of the light of the estimate within a resolution, where the extended source
 is expected to go on inwards as it is round it (`lnocl.core.scene.texture`). Flux and error follow

@@ -244,7 +244,7 @@ class _Reader:
         words = self._calibration.exposure
         if self._electrons.in_units is not None:
             if words:
-                note("`exposure` is left out: the electrons in the unit have it")
+                note("`exposure` is not used: the unit was already converted to electrons")
             return self._electrons.in_units
         if not words:
             return None

@@ -100,7 +100,7 @@ def _refuse_bad(j: int, bad: Mask) -> None:
 
 
 def sky_noise(j: int, counts: Array, mask: Mask) -> float:
-    """Return the noise that the sky of image j has beside that of its counts, electrons.
+    """Return the sky's noise in excess of Poisson noise in image j, electrons.
 
     It is that of pixels three apart in the darker half of the image, where the clipped scatter is
     more: sources that fill a frame scatter too.

@@ -155,8 +155,8 @@ def read_noise_map(
     kinds, paths = zip(*map(parse_kind, words), strict=True)
     if len(set(kinds)) > 1:
         raise InputError(
-            f"`noise` {kinds[0]} and {kinds[-1]} were given: each is all there is of noise; leave "
-            "one out"
+            f"`noise` {kinds[0]} and {kinds[-1]} were given: each describes the whole noise; "
+            "give one of them"
         )
     kind = kinds[0]
     values = errors() if list(words) == [ERR] else maps.read("noise", paths)

@@ -185,7 +185,7 @@ def _one_in_pixels(region: Any, number: int, path: str, header: fits.Header | No
     described = f"{name} of {path} ({kind})" if name != f"region {number}" else f"{name} ({kind})"
     if not region.meta.get("include", True):
         raise InputError(
-            f"{described} is to be left out of others: draw what is to be summed instead"
+            f"{described} is an exclusion region, which is not supported: draw the region to sum"
         )
     if isinstance(region, regions.SkyRegion):
         if header is None:

@@ -564,6 +564,6 @@ def make_result(outcome: Outcome) -> Result:
         smoothing=scene.penalty.smoothing,
         held_out=outcome.curve,
         psf_refinement=outcome.psf_refinement,
-        halo_fluxes=outcome.of_halos(outcome.star_fluxes),
+        halo_fluxes=outcome.halo_amounts(outcome.star_fluxes),
         _findings=outcome,
     )

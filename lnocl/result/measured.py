@@ -53,7 +53,7 @@ class Findings(Protocol):
     def star_errors(self) -> StarErrors:
         """Return the errors of stars and halos."""
 
-    def of_halos(self, fluxes: Array) -> Array:
+    def halo_amounts(self, fluxes: Array) -> Array:
         """Return those of fluxes that are of halos, electrons of each image, shape (n_halos, p)."""
 
     def extended_flux(self, star_flux_errors: Array) -> tuple[float, float]:
@@ -192,7 +192,7 @@ class Measured:
         >>> bool(190 < result.halo_flux_errors[0, 0] < 400)
         True
         """
-        return self._findings.of_halos(self._star_errors.fluxes)
+        return self._findings.halo_amounts(self._star_errors.fluxes)
 
     @property
     def star_position_errors(self) -> Array:

@@ -15,7 +15,7 @@ from commandline import one_complaint
 
 import lnocl
 from lnocl.commands import cli, errors
-from lnocl.commands.again import Again
+from lnocl.commands.again import RerunOfFile
 from lnocl.errors import InputError
 from lnocl.plotting.profiles import draw_bands
 
@@ -273,7 +273,7 @@ def test_replicas_are_made_on_the_device_of_the_run(words, monkeypatch):
     """It is named in the command, and may have been chosen among several."""
     monkeypatch.setattr("lnocl.commands.deconvolve._device_spec", lambda arguments: "0:7")
     assert cli.main(words) == 0
-    assert Again.read("out.fits", quiet=True).outcome().setup.device == "0:7"
+    assert RerunOfFile.read("out.fits", quiet=True).outcome().setup.device == "0:7"
 
 
 @pytest.mark.exhaustive
@@ -419,7 +419,7 @@ def test_killed_errors_go_on_bit_for_bit(words, monkeypatch):
 def test_another_flux_of_a_star_is_another_run():
     sky = np.ones((4, 5))
     saved = SimpleNamespace(path="a.fits", extended=sky, star_fluxes=np.array([7.0]))
-    again = Again(saved, SimpleNamespace(electrons=2.0), None, None)
+    again = RerunOfFile(saved, SimpleNamespace(electrons=2.0), None, None)
     found = {"observation": SimpleNamespace(sky_shape=(4, 5)), "sky": 2.0 * sky}
     again._refuse_another(SimpleNamespace(fluxes_of_stars=np.array([14.0]), **found))
     with pytest.raises(InputError, match="gives another result now"):

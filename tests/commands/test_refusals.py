@@ -60,7 +60,7 @@ BAD_ARGUMENTS = {
     "--saturation nan": "argument --saturation: 'nan' is not a finite number",
     "--noise ivar=negative.fits": "--noise negative.fits has the shape",
     "--noise err": "a.fits has no extension ERR; give --noise as a file, or ",
-    "--noise rms=a.fits err=a.fits": "--noise rms and err were given: each is all there is of",
+    "--noise rms=a.fits err=a.fits": "--noise rms and err were given: each describes the whole",
     "--noise a.fits": "--noise: 'a.fits' is not KIND=FILE; kinds are ivar, var, rms, err",
     "--noise rms": "argument --noise: 'rms' is not KIND=FILE",
     "--mask dq:16": "a.fits has no extension DQ; give --mask as a file, or",

@@ -21,7 +21,7 @@ START = {
     "initial_star_fluxes": np.repeat(FLUXES, 2) / 2,
 }
 pytestmark = pytest.mark.filterwarnings(
-    "ignore:psf . is sharper than its pixels", "ignore:the star at .* lies on bad pixels"
+    "ignore:psf . is undersampled", "ignore:the star at .* lies on bad pixels"
 )
 
 

@@ -71,7 +71,7 @@ class Made:
 MADE = {q: Made(q) for q in (2, 4)}
 
 # The PSFs are cut off, so that what is moved between pixels rings a little.
-pytestmark = pytest.mark.filterwarnings("ignore:psf . is sharper than its pixels")
+pytestmark = pytest.mark.filterwarnings("ignore:psf . is undersampled")
 
 
 def split_gradient(made, n_iter):

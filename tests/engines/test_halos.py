@@ -17,7 +17,7 @@ SOLVERS = "sgm", "sgp"
 pytestmark = pytest.mark.filterwarnings(
     "ignore:the noise of image",
     "ignore:the PSFs do not fit",
-    "ignore:psf . is sharper",
+    "ignore:psf . is undersampled",
     "ignore:the images are shifted",
 )
 

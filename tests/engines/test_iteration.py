@@ -22,7 +22,7 @@ from lnocl.core.scene.scene import Scene
 
 # PSFs here are small, and whole offsets periodic.
 pytestmark = pytest.mark.filterwarnings(
-    "ignore:psf . is sharper than its pixels", "ignore:the images are shifted by up to"
+    "ignore:psf . is undersampled", "ignore:the images are shifted by up to"
 )
 
 # Largest errors allowed (extended source, star fluxes) after so many iterations, about three

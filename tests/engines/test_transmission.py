@@ -15,7 +15,7 @@ from lnocl.core.scene.scene import Scene
 from lnocl.core.scene.star_check import warn_of_stars
 
 pytestmark = pytest.mark.filterwarnings(
-    "ignore:psf . is sharper than its pixels", "ignore:the star at .* lies on bad pixels"
+    "ignore:psf . is undersampled", "ignore:the star at .* lies on bad pixels"
 )
 START = {"initial_extended": np.full((NY, NX), 8.0), "initial_star_fluxes": FLUXES / 2}
 

@@ -29,7 +29,7 @@ from lnocl.core.solvers.positions import StarFit, Stars
 START = {"initial_extended": np.full((NY, NX), 8.0), "initial_star_fluxes": FLUXES / 2}
 
 # PSFs are cut off at their edges.
-pytestmark = pytest.mark.filterwarnings("ignore:psf . is sharper than its pixels")
+pytestmark = pytest.mark.filterwarnings("ignore:psf . is undersampled")
 
 
 MAPS = {"turned": None, "scaled": scenes_turned.scaled()}

@@ -343,7 +343,7 @@ class TestNoise:
         assert str(caught.value) == (
             "1.fits has no extension ERR; give noise as a file, or leave it out"
         )
-        with pytest.raises(InputError, match=r"^noise var and rms were given: each is all there"):
+        with pytest.raises(InputError, match=r"^noise var and rms were given: each describes"):
             observe(noise=["var=map.fits", "rms=map.fits"])
         with pytest.raises(FileError):
             observe(noise=["err", "err=map.fits"])

@@ -82,7 +82,7 @@ def test_regions_may_be_given_themselves():
         ("image\ncircle(2,21,4) # text={a}", r"^a of .*a.reg \(circle\) lies .*, or partly$"),
         ("image\npoint(3,3)", r"^region 1 \(point\) cannot be summed over: give circles, ellipses"),
         ("icrs\ncircle(30,10,1\")", r"is on the sky, and the image has no header: give pixels$"),
-        ("image\n-circle(20,20,4)", r"^region 1 \(circle\) is to be left out of others: draw what"),
+        ("image\n-circle(20,20,4)", r"^region 1 \(circle\) is an exclusion region"),
         ("image\ncircle(20,20,1e7)", r"^region 1 \(circle\) lies outside the image of 50 x 40"),
     ],
 )  # fmt: skip

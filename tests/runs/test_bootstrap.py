@@ -12,7 +12,7 @@ from scipy.stats import t
 import lnocl
 from lnocl.core.runs import bootstrap, quantities
 from lnocl.core.runs.bootstrap import Bootstrap, Quantity
-from lnocl.core.runs.repeated import Repeated
+from lnocl.core.runs.repeated import RerunWithCounts
 from lnocl.core.runs.replicas import Replicas
 from lnocl.core.runs.run import Run
 from lnocl.core.runs.start import Setup, make_start
@@ -27,7 +27,7 @@ RECIPES = {
     "masked, read noise": dataclasses.replace(BASE, masked=0.1, read_noise=2.0, shape=(30, 27)),
     "map of exposures": dataclasses.replace(BASE, exposure="map"),
 }
-pytestmark = pytest.mark.filterwarnings("ignore:psf . is sharper")
+pytestmark = pytest.mark.filterwarnings("ignore:psf . is undersampled")
 ENGINES = [
     ("numpy", "double"),
     pytest.param("opencl", "single", marks=pytest.mark.exhaustive),
@@ -159,14 +159,16 @@ def test_a_repeated_run_heeds_the_prior_that_it_is_given():
     outcome = told(np.array([1e-3]))
     counts = outcome.scene.observation.images
     fluxes = 1.1 * outcome.star_fluxes
-    found = Repeated(outcome).of((counts, StarPrior.of(fluxes, np.array([1e-3]))))[0]
+    found = RerunWithCounts(outcome).of((counts, StarPrior.of(fluxes, np.array([1e-3]))))[0]
     np.testing.assert_allclose(found.star_fluxes, fluxes, rtol=1e-3)
 
 
 def test_each_replica_has_a_prior_that_is_drawn_about_its_truth(monkeypatch):
     outcome, seen = told(np.array([20.0])), []
-    of = Repeated.of
-    monkeypatch.setattr(Repeated, "of", lambda *given: (seen.append(given[-1]), of(*given))[1])
+    of = RerunWithCounts.of
+    monkeypatch.setattr(
+        RerunWithCounts, "of", lambda *given: (seen.append(given[-1]), of(*given))[1]
+    )
     replicas = Replicas(outcome, 0)
     for k in range(12):
         replicas.reconstruct(k)

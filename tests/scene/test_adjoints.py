@@ -26,7 +26,7 @@ from lnocl.core.solvers.psf_fit import _PixelErrors, _sky
 
 pytestmark = [
     pytest.mark.filterwarnings("ignore:the images are shifted"),
-    pytest.mark.filterwarnings("ignore:psf . is sharper"),
+    pytest.mark.filterwarnings("ignore:psf . is undersampled"),
     pytest.mark.filterwarnings("ignore:the star at .* lies on bad pixels"),
 ]
 

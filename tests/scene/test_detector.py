@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from scipy.special import erf
 
 import lnocl
-from lnocl.core.scene.detector import DetectorPsf, on_sky, seen_psfs
+from lnocl.core.scene.detector import DetectorPsf, on_sky, psfs_on_detector
 from lnocl.core.scene.forward_model import Model
 from lnocl.core.scene.scene import Scene
 from lnocl.core.scene.texture import resolution
@@ -167,7 +167,7 @@ def test_a_psf_as_large_as_the_grid_goes_round(q):
 
 def test_psfs_as_pixels_see_them():
     observation = lnocl.Observation(np.ones((8, 8)), fine_gaussian(4, 0.8, 5), oversample=4)
-    (psf,) = seen_psfs(observation)
+    (psf,) = psfs_on_detector(observation)
     assert np.unravel_index(psf.argmax(), psf.shape) == (psf.shape[0] // 2, psf.shape[1] // 2)
     middle = psf.shape[0] // 2
     np.testing.assert_allclose(psf, gaussian(len(psf), middle, middle, 0.8), atol=1e-8)

@@ -160,7 +160,7 @@ def test_masks(images, mask, held):
 
 
 @pytest.mark.filterwarnings(
-    "ignore:psf . is sharper than its pixels", "ignore:the images are shifted by up to"
+    "ignore:psf . is undersampled", "ignore:the images are shifted by up to"
 )
 def test_input_is_copied_and_never_modified():
     given = {

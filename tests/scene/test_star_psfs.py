@@ -238,7 +238,7 @@ def test_the_psf_of_a_window_is_at_the_place_in_it():
     )
 
 
-@pytest.mark.filterwarnings("ignore:psf . is sharper than its pixels can hold")
+@pytest.mark.filterwarnings("ignore:psf . is undersampled")
 def test_derivatives_by_the_place_of_the_star_are_those_of_differences():
     scene = Scene(observe(star_places=(17.3, 21.2)), [(17.3, 21.2), PLANET], pad=12)
     model, sky = Model(scene), np.ones(scene.grid)

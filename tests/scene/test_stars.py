@@ -36,7 +36,7 @@ def scene_of(name):
 
 
 pytestmark = pytest.mark.filterwarnings(
-    "ignore:the images are shifted by up to", "ignore:psf . is sharper than its pixels"
+    "ignore:the images are shifted by up to", "ignore:psf . is undersampled"
 )
 
 

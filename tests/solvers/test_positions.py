@@ -25,7 +25,7 @@ from lnocl.core.solvers.positions import StarFit, Stars
 
 # PSFs here are small, and whole offsets periodic.
 pytestmark = pytest.mark.filterwarnings(
-    "ignore:psf . is sharper than its pixels",
+    "ignore:psf . is undersampled",
     "ignore:the images are shifted by up to",
     "ignore:the star at .* lies on bad pixels",
 )

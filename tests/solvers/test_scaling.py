@@ -80,7 +80,7 @@ def test_scaling_is_that_of_the_matrix():
 
 @pytest.mark.parametrize("psf_shape", [(9, 11), (40, 9), (128, 128)])
 @pytest.mark.parametrize("offsets", [[(0, 0), (0, 0)], [(1.4, -0.7), (-3, 2)]])
-@pytest.mark.filterwarnings("ignore:the images are shifted", "ignore:psf . is sharper")
+@pytest.mark.filterwarnings("ignore:the images are shifted", "ignore:psf . is undersampled")
 def test_cross_information_lies_in_a_window(psf_shape, offsets):
     """It is that of the whole grid, but for rounding; larger PSFs do not fit into a smaller one."""
     rng, stars = np.random.default_rng(5), [(60, 50), (70.3, 120.6), (0.2, 1.0)]
@@ -108,7 +108,7 @@ FAR, CLOSE, ROUND_THE_EDGE = [(40, 50)], [(40, 50), (47.3, 52.6)], [(0.2, 1.0), 
 
 @pytest.mark.exhaustive
 @pytest.mark.parametrize("stars", [[], FAR, CLOSE, ROUND_THE_EDGE])
-@pytest.mark.filterwarnings("ignore:psf . is sharper")
+@pytest.mark.filterwarnings("ignore:psf . is undersampled")
 def test_shift_is_that_of_the_whole_grid(stars):
     """Where stars light a small part of it, and where nothing tells one pixel from another."""
     rng, shape = np.random.default_rng(7), (2, 80, 96)

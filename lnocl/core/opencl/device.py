@@ -21,7 +21,7 @@ THREADS, MAX_THREADS = "POCL_MAX_PTHREAD_COUNT", 4096
 
 
 class Choice(NamedTuple):
-    """A device, why it was chosen, and the CPU that a GPU was taken before unasked."""
+    """A device, why it was chosen, and the CPU passed over where a GPU is the default."""
 
     device: cl.Device
     reason: str

@@ -26,7 +26,7 @@ def reversed_order(n: int) -> NDArray[np.int64]:
 
 
 def shortest_arc(held: NDArray[np.bool_]) -> tuple[int, int]:
-    """Return first and number of the shortest run of places, round the end, with all held ones.
+    """Return start and length of the shortest cyclic range that holds all True elements.
 
     It is one place where none is held.
     """

@@ -392,6 +392,6 @@ def _refuse_other(earlier: Bootstrap, expected: Bootstrap) -> None:
     )
     if not is_same:
         raise InputError(
-            "the replicas that are there are of another reconstruction, other regions or another "
-            "seed: give those, or begin anew"
+            "the file has replicas of another run, other regions or another seed: give the same, "
+            "or `overwrite`"
         )

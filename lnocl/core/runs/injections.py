@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from lnocl.core.runs.outcome import Outcome
-from lnocl.core.runs.repeated import Repeated
+from lnocl.core.runs.repeated import RerunWithCounts
 from lnocl.core.scene.apertures import FWHM
 from lnocl.core.scene.arrays import Array
 
@@ -30,7 +30,7 @@ class Injections:
 
     def __init__(self, outcome: Outcome, width: float) -> None:
         self._outcome, self._width = outcome, width
-        self._repeated = Repeated(outcome)
+        self._repeated = RerunWithCounts(outcome)
 
     def reconstruct(self, places: Array, fluxes: Array, rng: np.random.Generator) -> Outcome:
         """Return the reconstruction with sources at these places, pixels of the images.

@@ -10,7 +10,7 @@ from scipy.ndimage import binary_dilation
 
 from lnocl.core.runs.start import Setup
 from lnocl.core.scene.arrays import Array, Mask
-from lnocl.core.scene.detector import seen_psfs
+from lnocl.core.scene.detector import psfs_on_detector
 from lnocl.core.scene.noise_check import measure_noise
 from lnocl.core.scene.observation import Observation
 from lnocl.core.scene.penalty import Penalty
@@ -83,9 +83,9 @@ def mask_rays(setup: Setup) -> tuple[Setup, str]:
 def _psfs_of(observation: Observation) -> list[list[Array]]:
     """Return the PSFs of each image, as its pixels see them."""
     if not observation.psf_fields:
-        return [[psf] for psf in seen_psfs(observation)]
+        return [[psf] for psf in psfs_on_detector(observation)]
     return [
-        list(seen_psfs(observation, np.array([field.at(x, y) for y in ys for x in xs])))
+        list(psfs_on_detector(observation, np.array([field.at(x, y) for y in ys for x in xs])))
         for field in observation.psf_fields
         for xs, ys in [field.nodes]
     ]

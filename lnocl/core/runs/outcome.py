@@ -233,10 +233,10 @@ class Outcome:
             has_levels=levels,
         )
 
-    def of_halos(self, fluxes: Array) -> Array:
+    def halo_amounts(self, fluxes: Array) -> Array:
         """Return those of fluxes that are of halos, electrons of each image, shape (n_halos, p)."""
-        of_halos = fluxes[self.scene.n_stars :] * self.scene.mean_exposure
-        return of_halos.reshape(-1, self.scene.n_images)
+        halo_amounts = fluxes[self.scene.n_stars :] * self.scene.mean_exposure
+        return halo_amounts.reshape(-1, self.scene.n_images)
 
     @property
     def observation(self) -> Observation:

@@ -65,7 +65,7 @@ def measure(outcome: Outcome, sky: Sky, parts: Sequence[Part]) -> Array:
 def in_electrons(outcome: Outcome, fluxes: Array) -> Array:
     """Return the fluxes of stars that are shown, and of halos in electrons of their images."""
     n, is_shown = outcome.scene.n_stars, outcome.scene.is_shown
-    return np.append(fluxes[:n], outcome.of_halos(fluxes).ravel())[is_shown]
+    return np.append(fluxes[:n], outcome.halo_amounts(fluxes).ravel())[is_shown]
 
 
 def quantities_of(

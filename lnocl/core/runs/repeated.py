@@ -15,7 +15,7 @@ from lnocl.core.scene.star_prior import StarPrior
 from lnocl.process import ignored_warnings
 
 
-class Repeated:
+class RerunWithCounts:
     """Reconstructions like one, of images with the same background, PSFs and bad pixels.
 
     They are made by as many iterations, with the same penalty, from the same start. All use the

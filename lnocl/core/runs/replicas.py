@@ -9,7 +9,7 @@ from typing import NamedTuple, cast
 import numpy as np
 
 from lnocl.core.runs.outcome import Outcome
-from lnocl.core.runs.repeated import Repeated
+from lnocl.core.runs.repeated import RerunWithCounts
 from lnocl.core.scene.arrays import Array
 from lnocl.core.scene.estimate import Estimate
 from lnocl.core.scene.forward_model import Model
@@ -44,7 +44,7 @@ class Sky(NamedTuple):
 
 
 class Replica(NamedTuple):
-    """A sky that was drawn, what was found of it, and what was where the PSFs were wrong too."""
+    """A simulated sky and its reconstructions, with the right PSFs and with perturbed ones."""
 
     drawn: Sky
     found: Sky
@@ -87,7 +87,7 @@ class Replicas:
             self._pixels = PsfPixels(
                 observation.psfs, observation.psf_scatter, observation.oversample
             )
-        self._repeated = Repeated(outcome, n)
+        self._repeated = RerunWithCounts(outcome, n)
 
     def reconstruct(self, *numbers: int) -> list[Replica]:
         """Return replicas of these numbers.

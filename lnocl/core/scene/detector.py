@@ -47,7 +47,7 @@ def psfs_with_pixels(observation: Observation) -> list[Array]:
     return [psf.on_sky(0.0, 0.0).about_origin() / q**2 for psf in movable]
 
 
-def seen_psfs(observation: Observation, psfs: Array | None = None) -> Array:
+def psfs_on_detector(observation: Observation, psfs: Array | None = None) -> Array:
     """Return the PSFs, or others, as the pixels of the images see a star in the middle of one.
 
     Shape (p, n, n), the star at ``n // 2``; without oversampling they are those given.
@@ -126,7 +126,7 @@ class DetectorPsf:
         return self._seen(self.fine.at(self._q * x - self._lag, self._q * y - self._lag))
 
     def on_sky(self, x: float, y: float) -> Cutout:
-        """Return the light of a star at (x, y), pixels, in a pixel that begins at each fine one."""
+        """Return a star's light in a detector pixel whose corner lies at each fine pixel."""
         return self._seen(self.fine.at(*self._on_fine_pixels(x, y)))
 
     def at(self, x: float, y: float, axis: int | None = None) -> Cutout:

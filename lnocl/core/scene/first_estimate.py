@@ -150,8 +150,8 @@ def _refuse_if_too_bright(scene: Scene, light: float) -> None:
     most = scene.weights.max() if scene.weights is not None else 1.0
     if not math.isfinite(light * float(most) * float(scene.gains.max()) * scene.scale):
         raise InputError(
-            "what the images show in their shortest exposure is more, in the longest, than a "
-            "number holds: divide images and background by a constant"
+            "the counts predicted for the longest exposure overflow: divide images and "
+            "background by a constant"
         )
 
 

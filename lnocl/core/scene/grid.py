@@ -63,7 +63,7 @@ def grid_of(observation: Observation, pad: object) -> tuple[int, int]:
 
 
 def psf_shape(observation: Observation) -> tuple[int, int]:
-    """Return the shape of what holds all PSFs, pixels of the sky.
+    """Return the smallest shape that contains every PSF, pixels of the sky.
 
     Where images have several scales that is what is not 0 of each, times its scale; but for those
     of single stars, which are not those of the sky.
@@ -79,7 +79,7 @@ def psf_shape(observation: Observation) -> tuple[int, int]:
 
 
 def extent(observation: Observation) -> tuple[int, int]:
-    """Return the shape of what holds the sky of images that are turned, and what it passes through.
+    """Return the grid that holds the sky, the corners of rotated images and their shears.
 
     It is in pixels of the images, finer ones by `oversample` of which are the sky's.
     That is the frame of the sky, the corners of all images in it, and what two of the three shears

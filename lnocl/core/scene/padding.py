@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from lnocl.core.scene.arrays import Array
-from lnocl.core.scene.detector import seen_psfs
+from lnocl.core.scene.detector import psfs_on_detector
 from lnocl.core.scene.halos import rough_halos
 from lnocl.core.scene.observation import Observation
 
@@ -59,7 +59,7 @@ def recommend_pad(observation: Observation) -> int:
     7
     """
     most = max(1, int(SHARE_OF_SIDE * min(observation.shape)))
-    psfs = zip(seen_psfs(observation), observation.scales, strict=True)
+    psfs = zip(psfs_on_detector(observation), observation.scales, strict=True)
     return min(max(1, *(math.ceil(_radius(psf, LIGHT) * scale) for psf, scale in psfs)), most)
 
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from lnocl.core.scene.arrays import Array
 from lnocl.core.scene.counts import mean_exposure
-from lnocl.core.scene.detector import seen_psfs
+from lnocl.core.scene.detector import psfs_on_detector
 from lnocl.core.scene.observation import Observation
 from lnocl.core.scene.star_prior import StarPrior
 from lnocl.errors import InputError
@@ -95,7 +95,7 @@ def recommend_smoothing(observation: Observation) -> float:
     variance = np.ma.masked_array(
         relative**2 / np.maximum(observation.images, 1.0), observation.mask
     ).mean(axis=(1, 2))
-    squares = (seen_psfs(observation) ** 2).sum(axis=(1, 2))
+    squares = (psfs_on_detector(observation) ** 2).sum(axis=(1, 2))
     return SMOOTHING * float(np.sqrt((variance * squares).sum()))
 
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from lnocl.core.scene.arrays import Array
 from lnocl.core.scene.cores import fwhm
-from lnocl.core.scene.detector import seen_psfs
+from lnocl.core.scene.detector import psfs_on_detector
 from lnocl.core.scene.observation import Observation
 from lnocl.core.scene.psf_edge import psf_edge
 from lnocl.core.scene.shifting import ENDLESS, MovablePsf
@@ -68,7 +68,7 @@ def name_faults(observation: Observation, stars: Array) -> str:
     stars : ndarray of float64, shape (n, 2)
         Their places in the sky, with no PSFs of their own.
     """
-    for j, psf in enumerate(seen_psfs(observation)):
+    for j, psf in enumerate(psfs_on_detector(observation)):
         stamps = _stamps(observation, j, stars, psf)
         if name := _turn(psf, stamps) if stamps else "":
             return f"`psfs[{j}]` fits when it is {name}: give it so"

@@ -115,7 +115,7 @@ class Rotation:
         return self._phased(self.spread(sheared), self.row_phases().conj())
 
     def sampled(self, sheared: Array) -> Array:
-        """Return what the image's pixels have of a sky after its first shear."""
+        """Interpolate the once-sheared sky at the image's pixels."""
         for axis, sampling in enumerate(self.samplings):
             sheared = sampling.forward(sheared, axis)
         return sheared

@@ -17,7 +17,7 @@ import numpy as np
 from lnocl.core.scene.arrays import Array, Mask
 from lnocl.core.scene.blemishes import cosmic_rays
 from lnocl.core.scene.cores import fwhm
-from lnocl.core.scene.detector import seen_psfs
+from lnocl.core.scene.detector import psfs_on_detector
 from lnocl.core.scene.scene import Scene
 
 # The square in which a star is looked at reaches so many widths of its PSF from it, at least and at
@@ -119,7 +119,7 @@ def rays_on_stars(scene: Scene, known: Mask) -> Mask:
     are masked.
     """
     observation = scene.observation
-    rays, psfs = np.zeros(observation.mask.shape, bool), seen_psfs(observation)
+    rays, psfs = np.zeros(observation.mask.shape, bool), psfs_on_detector(observation)
     is_wide = [fwhm(psf) > SHARPEST for psf in psfs]
     for j, _, (rows, columns), core in _cores(scene):
         used, found = core.good.copy(), None
@@ -147,7 +147,7 @@ def _cores(scene: Scene) -> Iterator[tuple[int, int, tuple[slice, slice], _Core]
         return
     from scipy.spatial import KDTree  # which the start of a command need not load
 
-    widths = [fwhm(psf) for psf in seen_psfs(observation)]
+    widths = [fwhm(psf) for psf in psfs_on_detector(observation)]
     for j, width in enumerate(widths):
         reach = int(np.clip(np.ceil(REACH * width), LEAST_REACH, MOST_REACH))
         shown = np.flatnonzero(scene.shown[: scene.n_stars, j] & (scene.owned < 0))

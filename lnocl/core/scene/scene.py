@@ -230,7 +230,7 @@ class Scene:
 
     @cached_property
     def _psfs_of_sky(self) -> list[MovablePsf]:
-        """Those, times the relative exposure of their image where that is a number."""
+        """The PSFs of `psfs_of_sky`, each times its image's relative exposure."""
         return [movable_psf(psf, self.grid) for psf in self.scaled_psfs(self.psfs_of_sky())]
 
     @cached_property
@@ -408,7 +408,7 @@ class Scene:
         return len(self.shown)
 
     def holding(self, fluxes: Array, penalty: Penalty) -> Scene:
-        """Return this scene with its halos held, and the start that fluxes, scaled, leave."""
+        """Return a copy whose halo amounts stay at scaled `fluxes`, and the start that is left."""
         other = copy(self)
         other.rough_fit = RoughFit(fluxes, level_beside(self, fluxes))
         other.star_weights = np.append(self.star_weights[: self.n_stars], [HELD] * self.n_halos)

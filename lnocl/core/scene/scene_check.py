@@ -90,6 +90,6 @@ def _warn_of_ringing(
         dark = min(psf.min(), 0.0) - moved_psf.min() / scene.gains[j]
         if dark > MAX_RINGING * psf.max():
             warn(
-                f"`psfs[{j}]` is sharper than its pixels can hold: moved between pixels it "
-                f"rings by up to {dark / psf.max():.1%} of its peak, at whole pixels not"
+                f"`psfs[{j}]` is undersampled: shifted by half a pixel it rings by "
+                f"{dark / psf.max():.1%} of its peak"
             )

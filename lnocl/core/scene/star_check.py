@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from lnocl.core.scene.arrays import Array
 from lnocl.core.scene.cores import centroid, fwhm
-from lnocl.core.scene.detector import seen_psfs
+from lnocl.core.scene.detector import psfs_on_detector
 from lnocl.core.scene.scene import Scene
 from lnocl.core.scene.star_weights import warn_of_lost_stars
 from lnocl.errors import counted, warn
@@ -60,7 +60,7 @@ def check_stars(scene: Scene) -> Iterator[StarCheck]:
         return
     from scipy.spatial import KDTree  # which the start of a command need not load
 
-    for j, psf in enumerate(seen_psfs(observation)):
+    for j, psf in enumerate(psfs_on_detector(observation)):
         reach = int(np.clip(np.ceil(REACH * fwhm(psf)), LEAST_REACH, MOST_REACH))
         light = observation.images[j] - observation.background[j]
         shown = np.flatnonzero(scene.shown[: scene.n_stars, j])

@@ -172,7 +172,7 @@ class Orientation(NamedTuple):
 
     @classmethod
     def nearest(cls, linear: Array) -> tuple[Orientation, float]:
-        """Return what leaves least of a map's rotation, and the angle left, radians."""
+        """Return the nearest quarter turn or flip, and the remaining rotation, radians."""
         # Of both that leave half a right angle, the first.
         quarter = max(QUARTERS, key=lambda each: round(float((each * linear).sum()), 9))
         left = quarter.T @ linear

@@ -17,7 +17,7 @@ import numpy as np
 
 from lnocl.core.scene.arrays import Array
 from lnocl.core.scene.cores import fwhm
-from lnocl.core.scene.detector import seen_psfs
+from lnocl.core.scene.detector import psfs_on_detector
 from lnocl.core.scene.scene import Scene
 
 # Radii of the circles and of the ring, in the widths of the widest PSF, and pixels at least.
@@ -118,7 +118,7 @@ def _middle(values: Array, errors: Array) -> tuple[float, float]:
 
 def _photometry(scene: Scene, radius: float) -> tuple[Array, Array]:
     """Return fluxes and their variances, shape (p, n_stars); NaN where an image has none."""
-    psfs, scales = seen_psfs(scene.observation), scene.observation.scales
+    psfs, scales = psfs_on_detector(scene.observation), scene.observation.scales
     width = max(fwhm(psf) * scale for psf, scale in zip(psfs, scales, strict=True))
     found = np.full((scene.n_images, scene.n_stars // scene.n_epochs, 2), np.nan)
     for j, scale in enumerate(scales):

@@ -235,7 +235,7 @@ class NearStar:
         return prior
 
     def _source_error(self, around: Surroundings, amplitude: Array, width: float) -> SourceError:
-        """Return the error of the extended source in the window, and its change there."""
+        """Return the Gaussian field of the source's error there, and its map to the images."""
         shape, sky = self.window.shape, self.window.finer(around.scene.oversample).ranges
         maps = [
             camera.window(view.window.ranges, sky)
