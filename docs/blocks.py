@@ -6,6 +6,7 @@ A comment ``<!-- skip: next -->`` leaves the next block out.
 """
 
 import os
+import re
 import subprocess
 from contextlib import ExitStack, chdir, redirect_stdout
 from doctest import ELLIPSIS, NORMALIZE_WHITESPACE, OutputChecker
@@ -37,7 +38,7 @@ def run_shell(example):
 
 def compare_output(example):
     """Compare what a page shows with what was printed, but for white space."""
-    printed = example.namespace["_printed"]
+    printed = PROGRESS.sub("", example.namespace["_printed"])
     flags = ELLIPSIS | NORMALIZE_WHITESPACE
     same = OutputChecker().check_output(example.parsed, printed, flags)
     return None if same else f"the block before it prints:\n{printed}"
@@ -54,6 +55,8 @@ def leave_folder(namespace):
     namespace["_folder"].close()
 
 
+# Lines on progress, which slow machines have more of.
+PROGRESS = re.compile(r"^lnocl: [^:]*: ([^:]*, )?\d+ (s|min)\n", re.MULTILINE)
 RUN = {"python": run_python, "sh": run_shell, "output": compare_output}
 
 pytest_collect_file = Sybil(

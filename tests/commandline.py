@@ -1,6 +1,7 @@
 """Runs of the command line in a folder of files for it."""
 
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -127,3 +128,8 @@ def outcome(path):
             hdu.name: hdu.data if hdu.is_image else {n: hdu.data[n] for n in hdu.columns.names}
             for hdu in hdus
         }
+
+
+def without_progress(text):
+    """Return what a process has written less its lines on progress, which take their time."""
+    return re.sub(r"(?m)^lnocl: [^:]*: ([^:]*, )?\d+ (s|min)\n", "", text)

@@ -16,8 +16,12 @@ os.environ.setdefault(
 # Before NumPy is imported: the test processes are as many as the processors.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
+from lnocl import progress
 from lnocl.core.scene.observation import Observation
 from lnocl.io.calibration import Calibration
+
+# Lines on progress depend on how long a command takes.
+progress.FIRST_LINE = 1e9
 
 if size := os.environ.get("LNOCL_TEST_LOCAL_MEMORY"):
     import pyopencl as cl
