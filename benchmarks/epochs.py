@@ -84,7 +84,9 @@ def main():
     for seed in range(given.seeds[0], given.seeds[1] + 1):
         images, psfs, fluxes = simulate(seed, given.nights)
         begin = time.perf_counter()
-        observation = lnocl.Observation(images, psfs, background=SKY, epochs=range(given.nights))
+        observation = lnocl.Observation(
+            images, psfs, background=SKY, epochs=range(given.nights), psf_error=0.0
+        )
         result = lnocl.deconvolve(observation, PLACES)
         fitted = time.perf_counter()
         errors = result.star_flux_errors.reshape(4, -1)
