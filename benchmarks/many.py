@@ -40,7 +40,7 @@ def main():
     handler = logging.Handler()
     handler.emit = lambda record: said.append(record.getMessage())
     logging.getLogger("lnocl").addHandler(handler)
-    logging.getLogger("lnocl").setLevel("INFO")
+    logging.getLogger("lnocl").setLevel("DEBUG")
     began, cpu = time.perf_counter(), time.process_time()
     lnocl.deconvolve(lnocl.Observation(images, psf, background=50.0), stars, n_iter=10, stop=None)
     took, cpu = time.perf_counter() - began, time.process_time() - cpu

@@ -34,7 +34,16 @@ def measure(size: int, n_images: int, solver: str, stop: str) -> tuple[float, fl
         y, x = np.indices((101, 101)) - 50
         fits.writeto(f"{folder}/psf.fits", np.exp(-(x**2 + y**2) / 8.0))
         command = [
-            *(sys.executable, "-m", "lnocl", "deconvolve", *images, "--psf", f"{folder}/psf.fits"),
+            *(
+                sys.executable,
+                "-m",
+                "lnocl",
+                "deconvolve",
+                "--verbose",
+                *images,
+                "--psf",
+                f"{folder}/psf.fits",
+            ),
             *(
                 "--star",
                 f"{size // 2},{size // 2}",

@@ -103,8 +103,10 @@ def recorded(flags: Mapping[str, str], shows: Callable[[Warning], bool]) -> Iter
             show(message, *where, **more)
 
     warnings.showwarning = record
+    notes = _Notes(flags, lines.append, logging.DEBUG)
+    notes.addFilter(lambda record: not getattr(record, "is_passing", False))
     try:
-        with _handled(LOG, _Notes(flags, lines.append, logging.DEBUG)):
+        with _handled(LOG, notes):
             yield lines
     finally:
         warnings.showwarning = show

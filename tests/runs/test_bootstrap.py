@@ -440,7 +440,7 @@ def test_replicas_of_something_else_are_refused():
     result = solved()
     first = result.bootstrap(10)
     for other in (solved(n_iter=9).bootstrap, result.bootstrap):
-        with pytest.raises(lnocl.InputError, match="are of another reconstruction, other regions"):
+        with pytest.raises(lnocl.InputError, match="has replicas of another run, other regions"):
             other(12, earlier=first, seed=0 if other != result.bootstrap else 1)
 
 

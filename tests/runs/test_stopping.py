@@ -462,6 +462,6 @@ def test_each_phase_is_shown(monkeypatch):
     monkeypatch.setattr("sys.stderr", screen)
     options = {"stop": "held-out", "smoothing": "auto", "progress": True}
     lnocl.deconvolve(scene()[0], [STAR], engine="numpy", n_iter=60, **options)
-    phases = "judging the PSFs", "measuring steps", "fitting the stars", "iterations"
-    for phase in (*phases, "fitting stars, halos and levels"):
+    # Those without a number of steps are shown where they take long.
+    for phase in ("judging the PSFs", "fitting the stars", "iterations"):
         assert f"\r{phase}: " in screen.getvalue()

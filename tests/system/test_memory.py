@@ -27,6 +27,7 @@ import logging, sys
 import numpy as np
 import lnocl
 logging.basicConfig(level=logging.INFO, stream=sys.stdout)
+logging.getLogger("lnocl").setLevel(logging.DEBUG)
 n, p, error = map(float, sys.argv[1:])
 n, p = int(n), int(p)
 rng = np.random.default_rng(0)

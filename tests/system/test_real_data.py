@@ -18,7 +18,7 @@ from astropy.io import fits
 from astropy.io.fits.scripts import fitscheck
 from astropy.table import QTable
 from astropy.wcs import WCS
-from commandline import GIVEN, PAPER
+from commandline import GIVEN, PAPER, without_progress
 
 from lnocl.commands.cli import main
 from lnocl.errors import LnoclWarning
@@ -150,6 +150,8 @@ class TestLensedQuasar:
         )
         with fits.open("first.fits") as first, fits.open("out.fits") as again:
             for one, other in zip(first, again, strict=True):
+                if one.name == "MESSAGES":  # less is read from keywords and files
+                    continue
                 assert one.header.get("DATASUM") == other.header.get("DATASUM")
                 assert one.data.tobytes() == other.data.tobytes()
             cards = [
@@ -195,7 +197,7 @@ class TestAltair:
             capture_output=True, text=True, check=False, env=os.environ | {"PATH": path},
         )  # fmt: skip
         assert done.returncode == 0, done.stderr
-        assert done.stderr.splitlines() == [
+        assert without_progress(done.stderr).splitlines() == [
             "lnocl: warning: 24 saturated pixels of the PSF were repaired, and hold 15.46 % of its "
             "flux: its core is a guess"
         ]

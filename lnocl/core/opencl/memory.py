@@ -15,7 +15,7 @@ from lnocl.core.opencl.device import describe
 from lnocl.core.opencl.launch import READ_WRITE
 from lnocl.core.opencl.layout import Layout
 from lnocl.core.scene.arrays import Array
-from lnocl.errors import DeviceError, InputError, detail
+from lnocl.errors import LOG, DeviceError, InputError
 
 # Buffers of which each member of a batch has its own.
 OWN = {
@@ -224,11 +224,15 @@ def held_bytes() -> tuple[int, int]:
 
 
 def announce(device: cl.Device, device_bytes: int, host_bytes: int, tuned: str) -> None:
-    """Log what a scene takes on a device and on the host, and the tuning of the device."""
-    detail(
+    """Log what a scene takes on a device and on the host, and the tuning of the device.
+
+    It hangs on the process, and is no part of what a run has found.
+    """
+    LOG.debug(
         "%s: the scene takes %.1f MiB there, and up to %.0f MiB of the host's memory; %s",
         describe(device),
         device_bytes / 2**20,
         host_bytes / 2**20,
         tuned,
+        extra={"is_passing": True},
     )
