@@ -131,5 +131,5 @@ def outcome(path):
 
 
 def without_progress(text):
-    """Return what a process has written less its lines on progress, which take their time."""
+    """Return stderr without lines on progress, of which slow machines have more."""
     return re.sub(r"(?m)^lnocl: [^:]*: ([^:]*, )?\d+ (s|min)\n", "", text)

@@ -388,8 +388,11 @@ class Result(Measured):
 
     def _wcs_header(self) -> fits.Header | None:
         """Return the coordinates of the images, where they came with them."""
-        wcs = self._observation.wcs
-        return None if wcs is None else wcs.celestial.to_header(relax=True)
+        from astropy.wcs import WCS
+
+        wcs = self._observation.wcs  # which may be of another library, such as gwcs
+        is_known = isinstance(wcs, WCS) and wcs.has_celestial
+        return wcs.celestial.to_header(relax=True) if is_known else None
 
     def _repr_html_(self) -> str:
         """Return a table for a notebook, with a thumbnail where matplotlib is there."""

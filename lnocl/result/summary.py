@@ -163,10 +163,12 @@ def _light_curves(result: Result, unit: Unit) -> list[str]:
         np.reshape(each, (n_stars, n)) / unit.electrons
         for each in (result.star_fluxes, result.star_variation_errors)
     )
-    of_means = np.sqrt(np.nanmean(result.star_flux_covariances, axis=(1, 2))) / unit.electrons
     for k, place in enumerate(result.star_positions[::n]):
-        pairs = zip(fluxes[k], errors[k], strict=True)
-        mean = with_error(np.nanmean(fluxes[k]), of_means[k])
+        pairs, seen = zip(fluxes[k], errors[k], strict=True), np.isfinite(fluxes[k])
+        mean = with_error(np.nan, np.nan)
+        if seen.any():
+            shared = result.star_flux_covariances[k][np.ix_(seen, seen)].mean()
+            mean = with_error(fluxes[k][seen].mean(), np.sqrt(shared) / unit.electrons)
         columns.append([f"star {k + 1} {_rounded(place)}", *(with_error(*x) for x in pairs), mean])
     widths = [max(map(len, column)) for column in columns]
     rows = [

@@ -5,6 +5,7 @@ import pytest
 from astropy.io import fits
 from astropy.nddata import CCDData, NDData
 from astropy.wcs import WCS
+from astropy.wcs.wcsapi import HighLevelWCSWrapper, SlicedLowLevelWCS
 
 import lnocl
 
@@ -63,3 +64,13 @@ def test_tiles_have_those_of_the_whole(image):
     given = CCDData(np.tile(image, (3, 3)), unit="electron", wcs=wcs(65.0))
     tiled = solve(given, lambda *args, **more: lnocl.deconvolve_tiles(*args, tile=48, **more))
     assert tiled.to_ccddata().wcs.wcs.crval[0] == 65.0
+
+
+@pytest.mark.filterwarnings("ignore::lnocl.LnoclWarning")
+def test_those_that_a_header_cannot_hold_are_left_out(image, tmp_path):
+    """As of gwcs, or of axes that are not those of the sky."""
+    other = HighLevelWCSWrapper(SlicedLowLevelWCS(wcs(65.0), (slice(1, None), slice(None))))
+    for each in (other, WCS(naxis=2)):
+        result = solve(NDData(image, unit="electron", wcs=each))
+        assert result.to_ccddata().wcs is None
+        result.write(tmp_path / "sky.fits", overwrite=True)

@@ -116,3 +116,9 @@ def test_a_star_that_no_pixel_shows_is_unknown():
     _, lines = lines_of([(9.0, 12.0), (30.0, 8.0)], mask=mask)
     assert re.fullmatch(r"star 1 \(9, 12\) +unknown, as no good pixel shows it", lines[0])
     assert NUMBER.match(lines[1].partition(")")[2].strip())
+
+
+def test_a_star_that_no_epoch_shows_is_unknown_in_all():
+    mask = np.broadcast_to(X < 18, (3, 24, 40))
+    _, lines = lines_of([(9.0, 12.0), (30.0, 8.0)], 3, epochs=[0, 1, 2], mask=mask)
+    assert [line.split()[1] for line in lines[1:5]] == ["unknown"] * 4

@@ -226,7 +226,7 @@ def held_bytes() -> tuple[int, int]:
 def announce(device: cl.Device, device_bytes: int, host_bytes: int, tuned: str) -> None:
     """Log what a scene takes on a device and on the host, and the tuning of the device.
 
-    It hangs on the process, and is no part of what a run has found.
+    These figures depend on the process, so that the file of a result leaves them out.
     """
     LOG.debug(
         "%s: the scene takes %.1f MiB there, and up to %.0f MiB of the host's memory; %s",

@@ -397,7 +397,10 @@ def _tell_places(shifts: Array) -> None:
     """Say in a line for each image that lies elsewhere, by the shift of its PSF, in pixels."""
     for j, (dx, dy) in enumerate(shifts):
         if len(shifts) > 1 and np.hypot(dx, dy) > MISPLACED:
-            note(f"`images[{j}]` was ({dx:+.2f}, {dy:+.2f}) pixels from its offset, and is moved")
+            note(
+                f"`images[{j}]` was ({dx:+.2f}, {dy:+.2f}) pixels from its offset, or its PSF from "
+                "its centre: its PSF is moved"
+            )
 
 
 def _tell(given: _State, state: _State, tried: _State, done: Sequence[str]) -> None:

@@ -6,8 +6,8 @@ the star. Circles of three sizes tell a zero point, which all have, from a PSF t
 from light beside the star, such as a cosmic ray, that one image has.
 
 In several epochs a star may vary. So there a zero point is that of three stars or more: of the one
-in the middle, by their scatter. The scatter of few stars is small by chance, as Student's
-distribution says: three that vary by a tenth agree within a hundredth in one of 50 nights.
+in the middle, by their scatter. The median deviation of few stars is small by chance: of n it is
+taken to follow Student's distribution of n - 2 degrees of freedom (docs/validation/epochs.md).
 """
 
 from __future__ import annotations

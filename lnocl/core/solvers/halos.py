@@ -106,11 +106,11 @@ class _Joint:
 def _like_halos(scene: Scene, precisions: list[Array]) -> NDArray[np.int_]:
     """Return the stars of which halos share most of the information that images have of each."""
     n, shape = scene.n_stars, (scene.n_stars, scene.n_halos)
-    own, shared, halo_amounts = np.zeros(n), np.zeros(shape), np.zeros(scene.n_halos)
+    own, shared, of_halos = np.zeros(n), np.zeros(shape), np.zeros(scene.n_halos)
     for j, of_counts in enumerate(precisions):
         halos = {k: scene.star_image(j, n + k) for k in np.flatnonzero(scene.shown[n:, j]).tolist()}
         for k, halo in halos.items():
-            halo_amounts[k] = np.vdot(halo * of_counts, halo)
+            of_halos[k] = np.vdot(halo * of_counts, halo)
         for s in np.flatnonzero(scene.shown[:n, j]).tolist():
             star = scene.star_cutout(j, s)
             there = star.window(scene.image_grid)
@@ -118,7 +118,7 @@ def _like_halos(scene: Scene, precisions: list[Array]) -> NDArray[np.int_]:
             own[s] += np.vdot(weighted, star.values)
             for k, halo in halos.items():
                 shared[s, k] = np.vdot(weighted, halo[there])
-    whole = own[:, None] * halo_amounts
+    whole = own[:, None] * of_halos
     shares = np.divide(shared**2, whole, out=np.zeros(shape), where=whole > 0).max(axis=1)
     order = np.argsort(-shares, kind="stable")[:MOST_STARS]
     return np.sort(order[(shares[order] > SHARED) | (np.arange(len(order)) < LEAST_STARS)])
