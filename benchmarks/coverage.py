@@ -3,7 +3,8 @@
     python benchmarks/coverage.py [KIND...] [--seeds FIRST LAST] [--replicas 50] --output FOLDER
     python benchmarks/coverage.py --report --output FOLDER
 
-Each kind of scene has a jet, or a disc, of random knots, and stars, on 64 x 64 pixels (`KINDS`).
+Each kind of scene has a jet, or a disc, of random knots, or a ring thinner than a pixel, and stars,
+on 64 x 64 pixels (`KINDS`).
 Each observation is reconstructed by default, the stars' positions refined from up to 0.3 pixels
 off; its errors are of so many replicas. Measured are fluxes and positions of stars, apertures of 5
 to 20 pixels at random places of light, and the profile along y in strips of 2 pixels. Each
@@ -13,6 +14,7 @@ observation is a row of numbers in FOLDER; --report makes a table and the histog
 import argparse
 import re
 import warnings
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
@@ -43,6 +45,7 @@ KINDS = {
     "faint": (3e4, 1.0, 4, "fizeau", "jet", 1),
     "bright": (2e7, 1.0, 4, "fizeau", "jet", 1),
     "disc": (1e6, 1.0, 1, "gaussian", "disc", 1),
+    "ring": (3e4, 30.0, 1, "gaussian", "ring", 1),
 }
 DIAMETERS = 5, 5, 8, 8, 12, 12, 20, 20
 STRIPS = range(14, 54, 2)
@@ -87,7 +90,10 @@ def knots(rng, y, t, width, first, length):
 def make_sky(kind, rng, star):
     """Return an extended source of unit sum round or beside a star."""
     y, x = np.indices((N, N), float)
-    if kind == "disc":
+    if kind == "ring":
+        r = np.hypot(x - star[0], (y - star[1]) / rng.uniform(0.7, 1.0)) - rng.uniform(7, 12)
+        sky = np.exp(-0.5 * (r / 0.5) ** 2) * (1 + 0.5 * np.tanh((x - star[0]) / 6))
+    elif kind == "disc":
         r, angle = np.hypot(x - star[0], (y - star[1]) / rng.uniform(0.5, 1.0)), rng.uniform(0, 6)
         phi = np.arctan2(y - star[1], x - star[0])
         sky = knots(rng, r, 0.5 * np.sin(3 * phi + angle), 1.5, rng.uniform(0, 6), 16.0)
@@ -106,7 +112,7 @@ def observe(name, seed):
     light, contrast, p, psf, kind, n_stars = KINDS[name]
     rng = np.random.default_rng([seed, list(KINDS).index(name)])
     kernels = psfs(psf, p, seed % 4)
-    middle = np.array([32.0, 32.0] if kind == "disc" else STAR)
+    middle = np.array(STAR if kind in ("jet", "sharp") else [32.0, 32.0])
     stars = [middle + rng.uniform(-0.5, 0.5, 2)]
     sky = light * make_sky(kind, rng, stars[0])
     while len(stars) < n_stars:
@@ -162,6 +168,7 @@ def measure(name, seed, n):
             "value": found.values,
             "schur": schur,
             "errors": found.errors.T,
+            "smooth": found.of_smoothing,
             "n_iter": np.full(len(kinds), result.n_iter),
         }
     )
@@ -171,6 +178,7 @@ def score(rows):
     """Return how often the intervals of these rows hold the truth, and the ranks of the truth."""
     quantities = tuple(Quantity("", "flux", value) for value in rows["value"])
     found = Bootstrap(quantities, rows["errors"].T, np.zeros(0), np.zeros((2, 1, 1)), 1.0, 0)
+    found = replace(found, of_smoothing=rows["smooth"])
     holds = []
     for level in (0.68, 0.95):
         low, high = found.interval(level)
@@ -185,7 +193,7 @@ def score(rows):
 
 def pick(tables, pattern):
     """Return the rows of all tables whose quantity has such a name, as arrays."""
-    columns = {name: [] for name in ("truth", "value", "schur", "errors")}
+    columns = {name: [] for name in ("truth", "value", "schur", "errors", "smooth")}
     for table in tables:
         rows = table[[re.match(pattern, str(name)) is not None for name in table["quantity"]]]
         for name, values in columns.items():

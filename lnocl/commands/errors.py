@@ -244,6 +244,8 @@ def _summarise(found: Bootstrap, parts: Sequence[Part], frames: Frames) -> list[
             note = f"; has light in {100 * row['share']:.0f} % of replicas{note}"
         if len(found.of_psfs):
             note += f"; noise {row['error_noise']:.2g}, PSF {row['error_psf']:.2g}"
+        if "error_smoothing" in table.colnames and row["error"] <= row["error_smoothing"]:
+            note += "; smoothing changes it by as much as the error"
         lines.append(
             f"{row['name']}: {row['value'] - row['bias']:.6g} +- {row['error']:.2g} "
             f"{row['unit']} ({row['low95']:.6g} to {row['high95']:.6g}{note})"

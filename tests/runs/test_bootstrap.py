@@ -199,6 +199,63 @@ def test_stated_errors_of_stars_are_those_of_what_is_round_them():
     np.testing.assert_array_equal(less.standard_errors, alone.standard_errors)
 
 
+def test_errors_of_light_are_as_large_as_what_smoothing_changes():
+    star, sharp, broad = (Quantity(name, "flux", 100.0) for name in ("star 1 flux", "a", "b"))
+    errors = np.tile([[-1.0, -4.0, -4.0], [3.0, 2.0, 2.0]], (5, 1))  # of bias 1, -1 and -1
+    changes = np.array([0.0, 50.0, 0.5])
+    alone = Bootstrap((star, sharp, broad), errors, errors[:0], np.zeros((3, 8, 8)), 2.0, 0)
+    found = dataclasses.replace(alone, of_smoothing=changes)
+    expected = [alone.standard_errors[0], 51.0, alone.standard_errors[2]]
+    np.testing.assert_allclose(found.standard_errors, expected)
+    table = found.to_table(electrons=2.0)
+    np.testing.assert_allclose(table["error_smoothing"], [0.0, 25.5, 0.75])
+    assert "error_smoothing" not in alone.to_table().colnames
+
+
+def test_light_is_compared_with_that_of_as_many_iterations_without_smoothing():
+    smooth = solved()
+    sharp = solved(smoothing=0.0)
+    found = run_bootstrap(smooth._outcome, 10)
+    light = [each._outcome.light().sky() for each in (smooth, sharp)]
+    expected = [part.flux(light[0]) - part.flux(light[1]) for part in APERTURES]
+    np.testing.assert_allclose(found.of_smoothing[-2:], expected, rtol=1e-9)
+    assert not found.of_smoothing[:-2].any()
+    assert abs(found.of_smoothing[-2:]).min() > 0
+    assert not np.any(run_bootstrap(sharp._outcome, 10).of_smoothing)
+
+
+@pytest.mark.exhaustive
+def test_errors_hold_the_light_of_a_ring_thinner_than_a_pixel():
+    """Replicas of its smooth estimate have an error a third of this."""
+    from regions import CircleAnnulusPixelRegion, PixCoord
+
+    y, x = np.indices((128, 128))
+    middle, light = (66.3, 61.8), 24000.0
+
+    def spot(x0, y0):
+        """Return a Moffat function that is not round, and a Gaussian beside its middle."""
+        r2 = (x - x0) ** 2 + 1.2 * (y - y0) ** 2 + 0.3 * (x - x0) * (y - y0)
+        off = (x - x0 - 2.5) ** 2 + (y - y0) ** 2
+        return 0.057 * (1 + r2 / 11.3) ** -3.2 + 0.0014 * np.exp(-off / 18)
+
+    psf = spot(64, 64)
+    unit = psf.sum()
+    angles = np.linspace(0, 2 * np.pi, 150, endpoint=False)
+    shares = 1 + 0.5 * np.cos(angles - 0.8)
+    mean = 8e5 * spot(*middle)
+    for flux, phi in zip(light * shares / shares.sum(), angles.tolist(), strict=True):
+        mean += flux * spot(middle[0] + 9 * np.cos(phi), middle[1] + 9 * np.sin(phi))
+    counts = np.random.default_rng(2).poisson(mean / unit + 120.0)
+    observation = lnocl.Observation(counts, psf[33:96, 33:96], background=120.0, psf_error=0)
+    result = lnocl.deconvolve(observation, [middle])
+    annulus = CircleAnnulusPixelRegion(PixCoord(*middle), 5.0, 13.0)
+    found = result.bootstrap(20, regions=[annulus])
+    away = abs(found.values - found.bias - light)[-1]
+    of_replicas = dataclasses.replace(found, of_smoothing=0.0).standard_errors[-1]
+    assert away > 2.5 * of_replicas
+    assert away < 2.0 * found.standard_errors[-1]
+
+
 @pytest.mark.exhaustive
 def test_shares_of_stars_are_their_light_in_each_region():
     outcome = solved(refine_positions=True)._outcome

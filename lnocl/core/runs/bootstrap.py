@@ -14,8 +14,9 @@ import numpy as np
 
 from lnocl.core.runs.outcome import Outcome
 from lnocl.core.runs.quantities import Part, Quantity, in_electrons, measure, quantities_of
+from lnocl.core.runs.repeated import RerunWithCounts
 from lnocl.core.runs.replicas import Replica, Replicas
-from lnocl.core.scene.apertures import AMOUNT, FLUX, FWHM
+from lnocl.core.scene.apertures import AMOUNT, FLUX, FWHM, Aperture
 from lnocl.core.scene.arrays import Array, whole
 from lnocl.core.scene.texture import resolution
 from lnocl.errors import InputError
@@ -40,6 +41,8 @@ class Bootstrap:
     and reconstructed alike. Its errors are the values found less the values drawn. Their mean is
     the bias b, their standard deviation the standard error s. Where the stated errors of stars are
     larger than replicas tell, s has the rest too, with the share of each star that a region holds.
+    The light of a region, with its bias or without, is not more certain than it is near to that
+    without smoothing: replicas, which are as smooth as v, cannot tell how sharp the sky is.
     The interval of a level round the value v is
 
     .. math:: v - b \pm t \, s \sqrt{1 + 1 / n}
@@ -70,6 +73,9 @@ class Bootstrap:
         `lnocl.Result.halo_flux_errors`.
     shares : ndarray of float64, shape (k, n_fluxes)
         The share of each star's light that each quantity holds, 1 for its own flux.
+    of_smoothing : ndarray of float64, shape (k,)
+        The light of each region less that by as many iterations without smoothing, electrons; 0
+        for all else.
 
     See Also
     --------
@@ -106,6 +112,7 @@ class Bootstrap:
     unit: str = "electron"
     stated: Array = field(default_factory=lambda: np.zeros(0))
     shares: Array = field(default_factory=lambda: np.zeros((1, 0)))
+    of_smoothing: Array | float = 0.0
 
     @property
     def n(self) -> int:
@@ -127,7 +134,14 @@ class Bootstrap:
         """The standard errors, shape (k,), electrons or pixels."""
         variances = self.errors.var(axis=0, ddof=1)
         hidden = np.maximum(self.stated**2 - variances[: len(self.stated)], 0.0)
-        return np.asarray(np.sqrt(variances + self.shares**2 @ hidden))
+        found = np.sqrt(variances + self.shares**2 @ hidden)
+        return np.asarray(np.maximum(found, self._least))
+
+    @property
+    def _least(self) -> Array:
+        """The least errors of the light of regions, before and after the bias is taken from it."""
+        changed = np.broadcast_to(self.of_smoothing, self.bias.shape)
+        return np.where(changed, np.maximum(np.abs(changed), np.abs(changed - self.bias)), 0.0)
 
     def units(self, electrons: float) -> Array:
         """Return electrons in the unit of each quantity, 1 for positions, shape (k,)."""
@@ -212,7 +226,8 @@ class Bootstrap:
             Columns ``name``, ``at`` and ``unit``; ``value``, ``bias`` and ``error``; ``low68``,
             ``high68``, ``low95`` and ``high95``, the intervals; ``share``, that of replicas with
             the light; and ``note``. Where the scatter of the PSFs is known, ``error_psf`` is its
-            part of the error, and ``error_noise`` the rest.
+            part of the error, and ``error_noise`` the rest. Where light was smoothed,
+            ``error_smoothing`` is the least error of the light of regions.
 
         Examples
         --------
@@ -229,6 +244,8 @@ class Bootstrap:
         if len(self.of_psfs):
             columns["error_noise"] = (self.errors - self.of_psfs).std(axis=0, ddof=1)
             columns["error_psf"] = self.of_psfs.std(axis=0, ddof=1)
+        if np.any(self.of_smoothing):
+            columns["error_smoothing"] = self._least
         units = {FLUX: unit or self.unit, AMOUNT: "electron"}
         for level in LEVELS:
             low, high = self.interval(level)
@@ -286,6 +303,7 @@ def bootstrap(
     if earlier is not None:
         _refuse_other(earlier, found)
         found = earlier
+    found = replace(found, of_smoothing=_changed_by_smoothing(outcome, parts, found.values))
     size = 1 if parallel else min(_together(outcome), max(n - found.n, 1))
     batches = [range(k, min(k + size, n)) for k in range(found.n, n, size)]
     make = partial(_Measuring, outcome, parts, seed, found.resolution, size)
@@ -311,6 +329,21 @@ def without_replicas(outcome: Outcome, parts: Sequence[Part], seed: int) -> Boot
     none = np.zeros((0, len(quantities)))
     unit = "electron/s" if outcome.setup.is_rate else "electron"
     return Bootstrap(quantities, none, none, pixels, width, seed, unit, stated, shares)
+
+
+def _changed_by_smoothing(outcome: Outcome, parts: Sequence[Part], values: Array) -> Array:
+    """Return the light of regions less that without smoothing, 0 for other quantities, (k,)."""
+    penalty, changed = outcome.scene.penalty, np.zeros(len(values))
+    is_region = [isinstance(part, Aperture) for part in parts for _ in part.labels()]
+    if any(is_region) and (penalty.smoothing or penalty.near_stars is not None):
+        sharp = replace(penalty, smoothing=0.0, near_stars=None)
+        given = outcome.scene.observation.images, penalty.stars
+        (other,) = RerunWithCounts(outcome, penalty=sharp).of(given)
+        light = other.light().sky()
+        there = np.concatenate([part.measure(other.estimate.observed_sky, light) for part in parts])
+        of_parts = slice(len(values) - len(there), None)
+        changed[of_parts] = np.where(is_region, values[of_parts] - there, 0.0)
+    return changed
 
 
 def check_number(n: object, seed: object) -> None:

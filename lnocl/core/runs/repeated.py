@@ -11,6 +11,7 @@ from lnocl.core.runs.outcome import Outcome, marginalise
 from lnocl.core.runs.run import complete_together, make_runs
 from lnocl.core.runs.start import make_start
 from lnocl.core.scene.arrays import Array
+from lnocl.core.scene.penalty import Penalty
 from lnocl.core.scene.star_prior import StarPrior
 from lnocl.process import ignored_warnings
 
@@ -18,8 +19,8 @@ from lnocl.process import ignored_warnings
 class RerunWithCounts:
     """Reconstructions like one, of images with the same background, PSFs and bad pixels.
 
-    They are made by as many iterations, with the same penalty, from the same start. All use the
-    buffers and programs of one run.
+    They are made by as many iterations, from the same start. All use the buffers and programs of
+    one run.
 
     Parameters
     ----------
@@ -27,12 +28,15 @@ class RerunWithCounts:
         The reconstruction.
     n : int, optional
         As many are made together, at most.
+    penalty : Penalty, optional
+        By default that of the reconstruction.
     """
 
-    def __init__(self, outcome: Outcome, n: int = 1) -> None:
+    def __init__(self, outcome: Outcome, n: int = 1, penalty: Penalty | None = None) -> None:
         self._outcome = outcome
         with ignored_warnings():  # those of the reconstruction are the same
-            self._start = settle_halos(make_start(outcome.setup, outcome.scene.penalty))
+            start = make_start(outcome.setup, penalty or outcome.scene.penalty)
+            self._start = settle_halos(start)
         self._runs = make_runs([self._start] * n, max(len(outcome.objectives) - 1, 1))
 
     def of(self, *given: tuple[Array, StarPrior | None]) -> list[Outcome]:
