@@ -164,7 +164,8 @@ class Sky:
 
 def grid_of(kind, shape, pad):
     """Return the grid that lnocl takes."""
-    return lnocl.core.scene.grid.grid_of(sky(kind, shape, False, 0).observation(), pad)
+    observation, grid = sky(kind, shape, False, 0).observation(), lnocl.core.scene.grid
+    return grid.grid_of(observation, grid.pad_of(observation, pad))
 
 
 def measure(kind, shape, has_star, pad, solver, device):

@@ -266,7 +266,8 @@ def deconvolve_tiles(
     if isinstance(prepared.stop, str):
         chosen = _choose(observed, parallel, replace(prepared, is_within=False))
         prepared = _ending(prepared, chosen)
-    mosaic = _Mosaic(observation, positions, replace(plan, found=prepared.found), tiles[0])
+    plan = replace(plan, setup=replace(plan.setup, pad=pad), found=prepared.found)
+    mosaic = _Mosaic(observation, positions, plan, tiles[0])
     with (
         Progress(len(observed), "tile", progress, "deconvolving") as bar,
         closing(work(partial(partial, _solve, prepared), observed, parallel)) as answers,

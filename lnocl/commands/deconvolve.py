@@ -200,13 +200,13 @@ def _repeated(given: Mapping[str, Any], frames: Frames) -> dict[str, Any]:
 
 def _used(repeated: Mapping[str, Any], frames: Frames, result: Result) -> dict[str, Any]:
     """Return the values that were computed with, where rules and keywords were given."""
-    from lnocl.core.scene.padding import choose_pad
+    from lnocl.core.scene.grid import pad_of
 
     exposure = frames.observation.exposure
     return {
         "gain": frames.gain,
         "background": _levels(frames, result),
-        "pad": choose_pad(frames.observation) if repeated["pad"] == "auto" else repeated["pad"],
+        "pad": pad_of(result._observation, result._findings.setup.pad),
         **({"exposure": exposure.tolist()} if repeated["exposure"] and exposure.ndim == 1 else {}),
     }
 

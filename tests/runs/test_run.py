@@ -1,4 +1,6 @@
-"""Runs: the errors of stars that the images do not determine."""
+"""Runs: their grid, and the errors of stars that the images do not determine."""
+
+import dataclasses
 
 import numpy as np
 import pytest
@@ -46,3 +48,16 @@ def test_errors_of_a_star_with_one_good_pixel_are_nan():
     with pytest.warns(lnocl.LnoclWarning, match=r"of each star at \(\d+\.?\d*, "):
         fluxes, *_ = errors_of(run)
     assert np.isnan(fluxes).all()
+
+
+def test_the_pad_that_was_chosen_stays_when_levels_are_fitted():
+    """Runs of what was found would else be on another grid than it."""
+    counts = np.random.default_rng(0).poisson(100.0, (32, 32))
+    observation = lnocl.Observation(counts, PSF, background=100.0)
+    setup = Setup(observation, np.zeros((0, 2)), "auto", "sgm", "double", "numpy", None)
+    outcome = Run(make_start(setup, Penalty()), 1).outcome("n_iter")
+    fitted = outcome.setup.observation.replace(background=np.full((1, 32, 32), 70.0))
+    again = make_start(dataclasses.replace(outcome.setup, observation=fitted), Penalty())
+    assert again.scene.grid == outcome.scene.grid == (32, 32)
+    anew = make_start(dataclasses.replace(setup, observation=fitted), Penalty())
+    assert anew.scene.grid > (32, 32)

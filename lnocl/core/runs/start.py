@@ -162,6 +162,7 @@ def make_start(setup: Setup, penalty: Penalty) -> Start:
         As `deconvolve`.
     """
     scene = setup.scene(penalty)
+    setup = replace(setup, pad=scene.pad)  # for all that is made again of what the run finds
     extended, star_fluxes = scene.start(setup.initial_extended, setup.initial_star_fluxes)
     refines = setup.refine_positions and scene.n_stars > 0
     scaling = None

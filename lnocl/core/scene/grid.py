@@ -31,7 +31,23 @@ LENGTHS = sorted(
 )
 
 
-def grid_of(observation: Observation, pad: object) -> tuple[int, int]:
+def pad_of(observation: Observation, pad: object) -> int:
+    """Return how many unobserved pixels there are at least round the images, "auto" by a rule.
+
+    Raises
+    ------
+    InputError
+        `pad` is out of range.
+    """
+    if not (isinstance(pad, str) and pad == "auto"):
+        return whole("pad", pad, 0, ", or auto")
+    chosen = choose_pad(observation)
+    reason = "light runs" if chosen else "no light runs"
+    detail("`pad` chosen: %d pixels, as %s over the edge of the images", chosen, reason)
+    return chosen
+
+
+def grid_of(observation: Observation, pad: int) -> tuple[int, int]:
     """Return the shape (Ny, Nx) of the grid of a scene's images; its sky may be finer.
 
     It holds the images with their pad, and the PSFs, or as much of them as reaches from one end of
@@ -40,14 +56,9 @@ def grid_of(observation: Observation, pad: object) -> tuple[int, int]:
     Raises
     ------
     InputError
-        `pad` is out of range, or the images are too large for the transform.
+        The images are too large for the transform.
     """
-    if isinstance(pad, str) and pad == "auto":
-        pad = choose_pad(observation)
-        reason = "light runs" if pad else "no light runs"
-        detail("`pad` chosen: %d pixels, as %s over the edge of the images", pad, reason)
     shape = extent(observation) if observation.is_turned else observation.shape
-    pad = whole("pad", pad, 0, ", or auto")
     # Light that is farther from its source than the images are wide reaches none of them.
     most = MAX_AXIS // observation.oversample
     sizes = (-(-k // observation.oversample) for k in psf_shape(observation))

@@ -48,9 +48,7 @@ def recommend_pad(observation: Observation) -> int:
 
     Examples
     --------
-    >>> import math
-
-    import numpy as np
+    >>> import numpy as np
     >>> import lnocl
     >>> from lnocl.core.scene.padding import recommend_pad
     >>> y, x = np.indices((31, 31)) - 15
@@ -71,9 +69,7 @@ def runs_over_the_edge(observation: Observation) -> bool:
 
     Examples
     --------
-    >>> import math
-
-    import numpy as np
+    >>> import numpy as np
     >>> import lnocl
     >>> from lnocl.core.scene.padding import runs_over_the_edge
     >>> image = np.full((64, 64), 90.0)

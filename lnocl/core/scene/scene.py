@@ -15,7 +15,7 @@ from lnocl.core.scene.arrays import Array, numbers
 from lnocl.core.scene.counts import mean_exposure
 from lnocl.core.scene.detector import DetectorPsf, movable_psfs, on_sky, psfs_with_pixels
 from lnocl.core.scene.first_estimate import RoughFit, first_estimate, level_beside, rough_fit
-from lnocl.core.scene.grid import grid_of
+from lnocl.core.scene.grid import grid_of, pad_of
 from lnocl.core.scene.halos import halo_cutouts
 from lnocl.core.scene.observation import Observation
 from lnocl.core.scene.penalty import Penalty
@@ -68,6 +68,8 @@ class Scene:
 
     Attributes
     ----------
+    pad : int
+        Unobserved pixels round the images, at least.
     image_grid : tuple of int
         Shape (ny, nx), `lnocl.core.scene.grid.LENGTHS`; the images lie at its origin.
     grid : tuple of int
@@ -147,7 +149,8 @@ class Scene:
         self.owned = np.repeat(owned(observation, positions), observation.n_epochs)
         positions = np.repeat(positions, observation.n_epochs, axis=0)
         self.oversample = observation.oversample
-        self.image_grid = grid_of(observation, pad)
+        self.pad = pad_of(observation, pad)
+        self.image_grid = grid_of(observation, self.pad)
         ny, nx = self.image_grid
         self.grid = self.oversample * ny, self.oversample * nx
         # A power of two just above the mean; 1 where that is 0.
