@@ -100,10 +100,19 @@ class Option:
         value = values.get(self.keywords.get("nargs", ""), metavar)
         return value if self.is_positional else f"{self.flags[0]} {value}"
 
-    def but(self, needs: tuple[str, ...] | None = None, **keywords: Any) -> Option:
-        """Return the same option with other keywords for the parser, such as its help, or needs."""
-        needs = self.needs if needs is None else needs
-        return dataclasses.replace(self, keywords={**self.keywords, **keywords}, needs=needs)
+    def but(
+        self,
+        flags: tuple[str, ...] = (),
+        needs: tuple[str, ...] | None = None,
+        **keywords: Any,
+    ) -> Option:
+        """Return the same option with other flags, needs, or keywords, such as its help."""
+        return dataclasses.replace(
+            self,
+            flags=flags or self.flags,
+            keywords={**self.keywords, **keywords},
+            needs=self.needs if needs is None else needs,
+        )
 
     def words(self, value: Any) -> list[str]:
         """Return the words of a command line that give it a value; None gives no words."""

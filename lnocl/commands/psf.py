@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 import os
 from collections.abc import Mapping, Sequence
 from types import MappingProxyType
@@ -24,6 +25,8 @@ if TYPE_CHECKING:
     from lnocl.io.fitswrite import Card
     from lnocl.psf.make import StarPsf
 
+# A star that is left out lies so near to its place, pixels.
+NEAR = 5
 # Rows of a picture that can still be looked at.
 MAX_DRAWN = 16
 
@@ -52,6 +55,13 @@ OPTIONS = [
         "the PSF that they share",
     ),
     options.STAR_TABLE,
+    options.STARS.but(
+        ("--without",),
+        needs=("star_table",),
+        dest="without",
+        help="position of a star of --stars that is not taken, such as your target with what "
+        "surrounds it; may be repeated",
+    ),
     option(
         "--modes",
         type=int,
@@ -267,8 +277,19 @@ def _positions(
     arguments: argparse.Namespace, header: fits.Header
 ) -> list[tuple[float, float]] | None:
     """Return the positions of the stars that are given, by --star and --stars."""
-    given = arguments.position, arguments.star_table
-    return options.star_places(*given, header, arguments.frames[0]) or None
+    image = arguments.frames[0]
+    places = options.star_places(arguments.position, arguments.star_table, header, image)
+    for place in options.star_places(arguments.without, None, header, image):
+        away = [math.dist(place, star) for star in places]
+        if min(away, default=math.inf) > NEAR:
+            raise InputError(
+                f"{arguments.star_table} has no star within {NEAR} pixels of ({place[0]:.7g}, "
+                f"{place[1]:.7g}), which --without names: see its places, or leave that out"
+            )
+        del places[int(np.argmin(away))]
+    if arguments.without and not places:
+        raise InputError("--without leaves no star: give other stars")
+    return places or None
 
 
 def _check_outputs(arguments: argparse.Namespace) -> None:

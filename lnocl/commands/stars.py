@@ -113,8 +113,8 @@ def _summary_lines(stars: Table, n_extended: int, n_sharp: int) -> list[str]:
     if saturated:
         shown = ", ".join(saturated[:10]) + (", ..." if len(saturated) > 10 else "")
         lines.append(
-            f"{counted(len(saturated), 'star')} saturated: {shown}; mask their cores in lnocl "
-            "deconvolve, by --saturation or --mask, and their fluxes follow from their wings"
+            f"{counted(len(saturated), 'star')} saturated: {shown}; lnocl psf and lnocl deconvolve "
+            "take their wings alone"
         )
     return lines
 

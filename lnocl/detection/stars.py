@@ -7,23 +7,21 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy import ndimage
-from scipy.special import erf
 
 from lnocl.core.scene.arrays import Array, Mask, darker_noise
-from lnocl.core.scene.blemishes import flat_tops, sharp_pixels
+from lnocl.core.scene.blemishes import sharp_pixels
 from lnocl.core.scene.cores import core, fwhm
 from lnocl.core.scene.quantities import in_unit, split
 from lnocl.detection.checks import read_image, read_psf
+from lnocl.detection.defects import are_counts, saturated_pixels, sharpest_psf
 from lnocl.detection.maxima import SIGNIFICANT
 from lnocl.detection.search import PointSources, around, find_points, in_boxes, pixels_at
-from lnocl.errors import InputError, LnoclError, counted, note, warn
+from lnocl.errors import InputError, LnoclError, warn
 from lnocl.process import ignored_warnings
 
 if TYPE_CHECKING:
     from astropy.table import Table
 
-# No stars are narrower than this, full width at half maximum, pixels, where no PSF is known.
-SHARPEST = 1.5
 # The sky's level is a median over boxes of so many PSF widths, and of this many pixels or more.
 BOX_WIDTHS, MIN_BOX = 12, 24
 # Noise is measured in the image less the same, smoothed by a Gaussian of so many PSF widths.
@@ -158,14 +156,14 @@ def find_stars(
     shape = None if psf is None else read_psf(psf)
     width = FIRST_WIDTH if shape is None else fwhm(shape)
     above, noise = _above_sky(pixels, bad, width)
-    saturated = bad | _saturated(pixels, above / noise, bad, saturation) | _holes(above)
-    are_counts = _are_counts(pixels[~bad])
-    sharp = sharp_pixels(above, noise, saturated, [_sharpest_psf()], are_counts)
+    saturated = bad | saturated_pixels(pixels, above / noise, bad, saturation) | _holes(above)
+    counts = are_counts(pixels[~bad])
+    sharp = sharp_pixels(above, noise, saturated, [sharpest_psf()], counts)
     above, noise = _above_sky(pixels, bad | sharp, width)
     own = _measured_psf(above / noise, sought, is_all=shape is None)
     shape = own if shape is None else shape
     above, noise = _above_sky(pixels, bad | sharp, fwhm(shape))
-    sharp |= sharp_pixels(above, noise, saturated | sharp, [own, shape], are_counts)
+    sharp |= sharp_pixels(above, noise, saturated | sharp, [own, shape], counts)
     above, noise = _above_sky(pixels, bad | sharp, fwhm(shape))
     cores, covered = _saturated_stars(above / noise, saturated, fwhm(shape), sought)
     unit = float(noise.min()) if np.isfinite(noise).any() else 1.0
@@ -181,41 +179,15 @@ def find_stars(
     return stars[~narrow]
 
 
-def _saturated(pixels: Array, significance: Array, bad: Mask, saturation: float | None) -> Mask:
-    """Return which pixels are saturated, by the level that is given and by flat tops."""
-    given = np.zeros(bad.shape, bool) if saturation is None else pixels >= saturation
-    flat = flat_tops(pixels, significance, bad | given)
-    if flat.any():
-        lowest, highest = pixels[flat].min(), pixels[flat].max()
-        note(
-            f"{counted(int(flat.sum()), 'pixel')} of flat tops at {lowest:.10g}"
-            + (f" to {highest:.10g}" if highest > lowest else "")
-            + f" are taken as saturated, as by `saturation` {lowest:.10g}"
-        )
-    return given | flat
-
-
-def _sharpest_psf() -> Array:
-    """Return a PSF as sharp as optics leave it, a Gaussian of `SHARPEST`, summed in pixels."""
-    edges = np.arange(-3.5, 4.0) * np.sqrt(4.0 * np.log(2.0)) / SHARPEST
-    profile = np.diff(erf(edges))
-    return np.outer(profile, profile) / profile.sum() ** 2
-
-
 def _outside(pixels: Array) -> Mask:
     """Return blocks of pixels of exactly 0 in an image that is not of whole counts.
 
     They are outside the field: a mosaic has 0 there.
     """
     empty = pixels == 0
-    if not empty.any() or _are_counts(pixels[np.isfinite(pixels)]) or not pixels.any():
+    if not empty.any() or are_counts(pixels[np.isfinite(pixels)]) or not pixels.any():
         return np.zeros(pixels.shape, bool)
     return ndimage.binary_opening(empty, np.ones((3, 3)))
-
-
-def _are_counts(values: Array) -> bool:
-    """Return whether these are whole counts, and not all of them alike."""
-    return bool((values >= 0).all() and (values == np.round(values)).all() and np.ptp(values) > 0)
 
 
 def _require_photutils() -> None:
@@ -242,7 +214,7 @@ def _above_sky(pixels: Array, bad: Mask, width: float) -> tuple[Array, Array]:
     kernel = ndimage.gaussian_filter1d(impulse, SMOOTHER * width)
     squares = 1.0 - 2.0 * kernel.max() ** 2 + (kernel**2).sum() ** 2  # of an impulse less the same
     noise = in_boxes(rough, bad, box)[1] / np.sqrt(squares)
-    if _are_counts(pixels[~bad]):
+    if are_counts(pixels[~bad]):
         means = ndimage.uniform_filter(np.where(bad, 0.0, pixels), box)[~bad]
         noise = np.maximum(noise, np.sqrt(max(float(np.quantile(means, 0.25)), 1.0 / box**2)))
     # A flat part, such as one outside the field, has no noise.

@@ -28,10 +28,14 @@ FIRST_ROUNDS = 3
 # Outside its core, a star's pixel is a neighbour's where it exceeds another star's by this share,
 # significantly; and so are so many pixels beside it.
 EXCESS, BESIDE = 0.5, 2
+# After so many rounds a pixel that exceeds its star by this share of its peak, significantly, is a
+# cosmic ray.
+ROUGH_ROUNDS, RAY = 8, 0.2
 # Half the side of the square whose light is a star's first flux.
 APERTURE = 3
-# A star's core is where it is above this share of its peak; there it is fitted.
-CORE = 0.1
+# A star's core is where it is above this share of its peak; there it is fitted. Where none of that
+# is good, it is fitted down to the other share.
+CORE, FAINTEST = 0.1, 1e-3
 
 
 class FittedStar(NamedTuple):
@@ -100,7 +104,7 @@ def combine(light: Array, bad: Mask, centres: list[Point], half: int, n_given: i
     half : int
         The PSF reaches so many pixels from its middle.
     n_given : int
-        The first so many stars are given; their mean place stays.
+        The first so many stars are given; the mean place of those with good cores stays.
 
     Raises
     ------
@@ -185,6 +189,9 @@ class _Stars:
         self._fluxes = np.array(
             [cut_square(self._repaired, pixel, near).sum() for pixel in self._pixels]
         )
+        # Stars that were given, and are not saturated, say where the middle of the PSF is.
+        whole = [cut_square(~bad, nearest_pixel(each), near).all() for each in centres[:n_given]]
+        self._whole = np.array(whole)
         if not (self._fluxes > 0).all():
             s = int(np.argmin(self._fluxes))
             raise InputError(
@@ -213,12 +220,23 @@ class _Stars:
             ]
             psf += np.divide(sum(steps), weight, out=np.zeros_like(psf), where=weight > 0)
             self._fit(psf)
+            if done + 1 == ROUGH_ROUNDS and self._n_own > 2:
+                self._leave_rays(psf)
+                shown[: self._n_own] = self._shown()[: self._n_own]
         weight = np.einsum("s,syx->yx", self._fluxes, used)
         hidden = np.einsum("s,syx->yx", self._fluxes, shown) == 0
         repair(psf, hidden, hidden)
         covered = (weight == 0) & ~hidden  # by others: what lies opposite is the best guess
         psf[covered] = np.where(covered, 0.0, psf)[::-1, ::-1][covered]
         return self._finished(psf, used)
+
+    def _leave_rays(self, psf: Array) -> None:
+        """Take pixels for bad that far exceed a star, in its core too, as others have it."""
+        left, _ = self._residual(psf)
+        for s, c in enumerate(self._fluxes[: self._n_own]):
+            is_ray = left[self._window(s)] > max(RAY * c * psf.max(), SIGNIFICANT * self._noise)
+            self._good[self._window(s)] &= ~is_ray
+        self._light *= self._good
 
     def _finished(self, psf: Array, shown: Array) -> EffectivePsf:
         (left, _), n = self._residual(psf), self._n_own
@@ -278,7 +296,7 @@ class _Stars:
         return left, overlap
 
     def _fit(self, psf: Array) -> None:
-        """Fit the fluxes and places of the stars, each by least squares in its core."""
+        """Fit the fluxes and places of the stars, each by least squares where it is bright."""
         movable = MovablePsf(psf, psf.shape)
         left, _ = self._residual(psf)
         steps = np.zeros((len(self._places), 2))
@@ -287,6 +305,8 @@ class _Stars:
             there = self._window(s)
             star = movable.with_slopes(*self._middle(s)).on_grid(psf.shape)
             used = core & self._good[there]
+            if used.sum() < len(star):  # of a saturated star the wings are left
+                used = (psf > FAINTEST * psf.max()) & self._good[there]
             if used.sum() < len(star):
                 raise InputError(
                     f"the star at {self._name(s)} has too few good pixels; leave it out"
@@ -294,8 +314,8 @@ class _Stars:
             found, moves = step([star], np.array([c]), left[there] + c * star[0], used)
             self._fluxes[s] = max(found[0], c / 2)
             steps[s] = moves[0, ::-1]
-        n = self._n_given
-        self._places += steps - np.average(steps[:n], axis=0, weights=self._fluxes[:n])
+        weights = self._fluxes[: self._n_given] * (self._whole if self._whole.any() else 1.0)
+        self._places += steps - np.average(steps[: len(weights)], axis=0, weights=weights)
 
     def _name(self, s: int) -> str:
         y, x = self._places[s] - self._half

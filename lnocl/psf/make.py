@@ -353,26 +353,24 @@ def make_psfs(
     if not isinstance(background, str):
         background = in_unit("background", background, unit or "")
     given, bad = read_image("frame", frame, mask)
-    saturated = ~bad & (given >= checks.saturation_level(saturation))
-    unusable = bad | saturated
     side, angles = checks.whole_size(size), checks.wrapped_angles(rotate)
     recentre, clip_negative = flag("recentre", recentre), flag("clip_negative", clip_negative)
-    if unusable.all():
-        raise InputError("all pixels of the frame are bad; give a frame that shows a star")
     # A repaired pixel takes nothing from its value, however far beyond the level that is.
     pixels = np.where(bad, 0.0, np.minimum(given, checks.saturation_level(saturation)))
+    if bad.all() or (pixels[~bad] >= checks.saturation_level(saturation)).all():
+        raise InputError("all pixels of the frame are bad; give a frame that shows a star")
     half = None if side is None else max(resampling.reach(side, angle) for angle in angles)
 
     places, found = steps.find_stars(pixels, bad, position)
+    saturated, rays = steps.find_defects(pixels, bad, places, saturation)
+    unusable = bad | saturated | rays
     level, measured = steps.measure_background(background, pixels, unusable, places, half)
     light = np.where(unusable, 0.0, pixels - level)
     region = steps.reachable(pixels.shape, places, half)
     unrepairable, repaired = steps.repair_bad(light, unusable, saturated, region)
     centres, shift, centred, width = steps.find_centres(light, unusable, places, level, recentre)
     middles = [steps.nearest_pixel(centre) for centre in centres]
-    side = min(
-        steps.fitting_side(given.shape, pixel, side, angle) for angle in angles for pixel in middles
-    )
+    side = min(steps.fitting_side(given.shape, middles, side, angle) for angle in angles)
     if len(middles) == 1:
         (pixel,) = middles
         steps.refuse_hole(unrepairable, pixel)

@@ -12,8 +12,10 @@ from scipy.ndimage import label, maximum_filter, value_indices
 
 from lnocl.core.scene.apertures import FWHM
 from lnocl.core.scene.arrays import Array, Mask, numbers
+from lnocl.core.scene.blemishes import sharp_pixels
 from lnocl.core.scene.psf_edge import LEAST_RADIUS, psf_edge
 from lnocl.core.scene.shifting import ENDLESS, MARGIN, MovablePsf
+from lnocl.detection.defects import are_counts, saturated_pixels, sharpest_psf
 from lnocl.detection.fitting import fit
 from lnocl.detection.maxima import SIGNIFICANT
 from lnocl.errors import InputError, counted, warn
@@ -36,6 +38,9 @@ BRIGHT = 0.05
 # It is a star where the brightest given one, moved there, leaves no more than this share of its
 # peak and so many times the noise (rms), to so many widths; else it is masked.
 WITHIN, ALIKE, NOISY, MASKED = 1.5, 0.05, 2.0, 2.0
+# Fringes as fine as the pixels may have this share of a star's peak; less noise than the other is
+# rounding.
+FINE, NOISELESS = 1e-3, 1e-6
 # Growth of negative pixels by shift and rotation that calls for a warning: a share of the flux on
 # top of a share of the negative flux before, since both change noise too.
 RINGING, OF_NOISE = 0.01, 0.2
@@ -65,6 +70,26 @@ def find_stars(
         places.append(start)
         lines.append(f"star: given at x = {x:g}, y = {y:g}")
     return places, lines
+
+
+def find_defects(
+    pixels: Array, bad: Mask, starts: list[Pixel], saturation: float | None
+) -> tuple[Mask, Mask]:
+    """Return saturated pixels, by their level and by flat tops, and rays and hot pixels.
+
+    Where a star may be these are not told from one that the pixels undersample.
+    """
+    good = pixels[~bad]
+    light = np.where(bad, 0.0, pixels - np.median(good))
+    peak = float(light[_distance(bad.shape, starts) <= SEARCH].max())
+    scatter = float(mad_std(good))
+    noise = math.hypot(scatter, FINE * peak)
+    # Without noise pixels are alike by symmetry.
+    significance = light / scatter if scatter > NOISELESS * peak else np.zeros(bad.shape)
+    saturated = saturated_pixels(pixels, significance, bad, saturation)
+    unknown, psfs = bad | saturated, [sharpest_psf()]
+    rays = sharp_pixels(light, np.full(bad.shape, noise), unknown, psfs, are_counts(good))
+    return saturated, rays & (_distance(bad.shape, starts) > SEARCH)
 
 
 def reachable(shape: tuple[int, ...], starts: list[Pixel], half: int | None) -> Mask:
@@ -273,18 +298,26 @@ def _largest(shape: tuple[int, ...], pixel: Pixel, angle: float) -> int:
     return side
 
 
-def fitting_side(shape: tuple[int, ...], pixel: Pixel, side: int | None, angle: float) -> int:
-    """Return the side of the PSF: as asked for if the frame has it, or the largest there is."""
-    largest = _largest(shape, pixel, angle)
-    if largest < MIN_SIZE:
-        raise InputError(f"the star at {_at(pixel)} is at the edge of the frame; give another")
+def fitting_side(
+    shape: tuple[int, ...], pixels: list[Pixel], side: int | None, angle: float
+) -> int:
+    """Return the side of the PSF: as asked for if one star has it, or the largest that all have.
+
+    What the frame does not show of the other stars is left to that one.
+    """
+    sides = [_largest(shape, pixel, angle) for pixel in pixels]
+    if min(sides) < MIN_SIZE:
+        edge = pixels[int(np.argmin(sides))]
+        raise InputError(f"the star at {_at(edge)} is at the edge of the frame; give another")
+    largest = max(sides)
     if side is None:
-        return largest
+        return min(sides)
     if side > largest:
         turned = f", rotated by {angle:g} degrees," if angle else ""
         raise InputError(
-            f"a PSF of {side} x {side} pixels{turned} around the star at {_at(pixel)} reaches "
-            f"beyond the frame; give a size of {largest} or less"
+            f"a PSF of {side} x {side} pixels{turned} around the star at "
+            f"{_at(pixels[int(np.argmax(sides))])} reaches beyond the frame; give a size of "
+            f"{largest} or less"
         )
     return side
 

@@ -182,6 +182,7 @@ class TestNamesOfOutputs:
 
 # Words that are ignored without others, and these.
 NEEDED = {
+    "psf f.fits -o p.fits --without 3,4": "--stars",
     "deconvolve i.fits --psf p.fits -o o.fits --centre 3,4": "--angle",
     "deconvolve i.fits --psf p.fits -o o.fits --epoch each": "--star or --stars",
     "deconvolve i.fits --psf p.fits -o o.fits --refine": "--star or --stars",

@@ -297,6 +297,29 @@ class TestCheck:
         assert "1.00 pixels off" in said[15]
 
 
+class TestAStarOfTheTable:
+    def test_is_left_out_where_it_is_the_target(self):
+        Path("stars.csv").write_text("x,y\n30.3,28.8\n50,45\n")
+        assert run("--stars", "stars.csv", "--without", "31,27", "--size", "15") == 0
+        header = fits.getheader("out.fits")
+        assert header["NSTARS"] == 1
+        assert (header["CENTREX"], header["CENTREY"]) == pytest.approx((50, 45), abs=0.1)
+        assert "--without 31.0,27.0" in str(header["HISTORY"]).replace("\\\n", "")
+
+    @pytest.mark.parametrize(
+        ("options", "message"),
+        [
+            (["--stars", "stars.csv", "--without", "10,10"], "has no star within 5 pixels of"),
+            (["--stars", "one.csv", "--without", "30,29"], "leaves no star: give other stars"),
+        ],
+    )
+    def test_is_refused_where_it_is_none(self, capsys, options, message):
+        Path("stars.csv").write_text("x,y\n30.3,28.8\n50,45\n")
+        Path("one.csv").write_text("x,y\n30.3,28.8\n")
+        assert run(*options, "--size", "15") == 2
+        assert message in capsys.readouterr().err
+
+
 class TestTheFile:
     def test_the_header_says_what_was_done(self):
         options = ("--mask", "mask.fits", "--saturation", "8900", "--rotate", "0", "30")

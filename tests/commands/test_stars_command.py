@@ -69,7 +69,10 @@ def test_saturated_stars_are_named(capsys):
     fits.writeto("image.fits", counts, overwrite=True)
     command = ["stars", "image.fits", "--saturation", "1500", "-o", "stars.ecsv"]
     assert cli.main(command) == 0
-    assert "1 star saturated: 1; mask their cores in lnocl deconvolve" in capsys.readouterr().out
+    assert (
+        "1 star saturated: 1; lnocl psf and lnocl deconvolve take their wings"
+        in capsys.readouterr().out
+    )
     stars = Table.read("stars.ecsv")
     assert stars["saturated"].tolist() == [True, False]
     assert "ra" not in stars.colnames
@@ -82,7 +85,7 @@ def test_cosmic_rays_and_flat_tops_are_told(capsys):
     assert cli.main(["stars", "image.fits", "--psf", "psf.fits", "-o", "stars.ecsv"]) == 0
     told = capsys.readouterr()
     assert "2 sources sharper than the PSF left out, as cosmic rays and bad pixels" in told.out
-    assert "1 star saturated: 1; mask their cores" in told.out
+    assert "1 star saturated: 1; lnocl psf" in told.out
     assert "of flat tops at 1500 are taken as saturated, as by --saturation 1500\n" in told.err
     assert len(Table.read("stars.ecsv")) == 2
 

@@ -11,7 +11,7 @@ from lnocl.detection import search
 from lnocl.errors import InputError, LnoclError, LnoclWarning
 
 pytest.importorskip("photutils", reason="photutils is not installed")
-from lnocl.detection import find_stars, stars
+from lnocl.detection import defects, find_stars
 
 SHAPE = (96, 110)
 Y, X = np.indices(SHAPE)
@@ -313,6 +313,6 @@ def test_without_photutils_one_line_says_what_to_install(monkeypatch):
 def test_the_sharpest_psf_is_a_gaussian_of_its_width_in_pixels():
     """Summed at a hundred points a pixel."""
     x = np.linspace(-3.495, 3.495, 700)
-    profile = np.exp(-4.0 * np.log(2.0) * (x / stars.SHARPEST) ** 2).reshape(7, 100).sum(axis=1)
+    profile = np.exp(-4.0 * np.log(2.0) * (x / defects.SHARPEST) ** 2).reshape(7, 100).sum(axis=1)
     expected = np.outer(profile, profile) / profile.sum() ** 2
-    np.testing.assert_allclose(stars._sharpest_psf(), expected, rtol=1e-3)
+    np.testing.assert_allclose(defects.sharpest_psf(), expected, rtol=1e-3)

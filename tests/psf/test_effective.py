@@ -125,6 +125,37 @@ def test_stars_packed_within_the_window_are_not_its_wings(n_given, most):
     assert abs(star.psf - expected / expected.sum()).max() < most * expected.max()
 
 
+def test_pixels_beyond_the_frame_are_left_to_other_stars():
+    places = [*PLACES, (133.6, 60.2)]
+    frame = a_frame(2.5, places, [*FLUXES, 0.9])
+    star = make_psf(frame, places, SIZE, background=0.0)
+    assert error(star, 2.5) < 2e-5
+    with pytest.raises(InputError, match="give a size of 12 or less"):
+        make_psf(frame, places[-1], SIZE, background=0.0)
+
+
+def test_a_saturated_star_adds_wings_and_does_not_move_the_centre():
+    rng = np.random.default_rng(5)
+    places = [(60.62, 61.37), *PLACES]
+    frame = rng.poisson(100.0 + a_frame(4.0, places, [20.0, *FLUXES]))
+    star = make_psf(np.minimum(frame, 12_000), places, 31)
+    assert "of them saturated" in line(star, "bad pixels")
+    off = np.average(np.subtract(star.centres[1:], PLACES), axis=0, weights=FLUXES)
+    assert abs(off).max() < 0.01
+    expected = gaussian(4.0, 15, 15, (31, 31))
+    assert abs(star.psf - expected).max() < 0.04 * expected.max()
+
+
+def test_cosmic_rays_beside_stars_and_in_a_core_are_left_out():
+    rng = np.random.default_rng(6)
+    frame = rng.poisson(100.0 + a_frame(3.4)).astype(float)
+    clean = make_psf(frame, PLACES, SIZE)
+    frame[[70, 71, 50, 12, 88], [60, 61, 101, 20, 97]] += 3000.0  # the last in a core
+    star = make_psf(frame, PLACES, SIZE)
+    assert abs(star.psf - clean.psf).max() < 0.01 * clean.psf.max()
+    np.testing.assert_allclose(star.centres, PLACES, rtol=0, atol=0.02)
+
+
 def test_bad_and_saturated_pixels_are_left_to_other_stars():
     frame = a_frame(2.5)
     frame[30:32, 30:32] = 1e7
