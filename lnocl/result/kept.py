@@ -56,6 +56,9 @@ def to_parts(outcome: Outcome, given: Observation) -> Parts:
     parts["positions"] = scene.stars
     for name in BY_COMMAND:
         parts.pop(f"setup.{name}", None)
+    if (moved := scene.observation.offsets - before.offsets).any():
+        parts["moved"] = moved
+        before = before.moved(moved)
     mask = scene.observation.mask
     if not np.array_equal(mask, before.mask):
         parts["observation.mask"] = mask
@@ -66,7 +69,7 @@ def to_parts(outcome: Outcome, given: Observation) -> Parts:
         if not (old is new or np.array_equal(old, new)):
             is_shared = new.ndim > 2 and new.strides[0] == 0  # one for all images
             parts[f"observation.{name}"] = new[:1] if is_shared else new
-    return {**parts, DIGEST: np.asarray(_digest(parts, before))}
+    return {**parts, DIGEST: np.asarray(_digest(parts, given.upright()))}
 
 
 def from_parts(
@@ -80,6 +83,8 @@ def from_parts(
     parts, before = dict(parts), given.upright()
     if DIGEST not in parts or str(parts.pop(DIGEST)) != _digest(parts, before):
         return None
+    if "moved" in parts:
+        before = before.moved(parts["moved"])
     changes = _part(parts, "observation.")
     changes.pop("mask", None)
     observation = _masked(before, parts).replace(**changes)

@@ -17,6 +17,7 @@ from lnocl.core.runs.plan import (
     EXPOSURES,
     HALOS,
     LEVELS,
+    PLACES,
     PRIOR,
     PSFS,
     RAYS,
@@ -55,8 +56,14 @@ SCENES = {
         {CORES, RAYS, PSFS, STARS},
         "another rule",
     ),
-    "turned": (lambda: observe(2, transforms=TURNED), STAR, {}, PLAIN | {EXPOSURES}, "no halos"),
-    "epochs": (lambda: observe(2, epochs=[0, 1]), STAR, {}, PLAIN, "no halos"),
+    "turned": (
+        lambda: observe(2, transforms=TURNED),
+        STAR,
+        {},
+        PLAIN | {PLACES, EXPOSURES},
+        "no halos",
+    ),
+    "epochs": (lambda: observe(2, epochs=[0, 1]), STAR, {}, PLAIN | {PLACES}, "no halos"),
     "a halo": (lambda: observe(halos=[HALO]), STAR, {}, PLAIN | {HALOS}, "have no error"),
     "a field": (lambda: observe(psfs=FIELD), STAR, {}, PLAIN, "no halos"),
     "levels": (lambda: observe(background_error=1.0), STAR, {}, PLAIN | {LEVELS}, "no halos"),
@@ -91,6 +98,7 @@ def test_a_run_takes_the_steps_of_its_plan(name, monkeypatch):
         monkeypatch.setattr(module, function, watched)
 
     watch(CORES, mends, "mask_cores")
+    watch(PLACES, mends, "align_images")
     watch(RAYS, mends, "mask_rays")
     watch(EXPOSURES, mends, "fit_exposures")
     watch(PSFS, psf_refinement, "mend")

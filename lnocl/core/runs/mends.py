@@ -14,13 +14,35 @@ from lnocl.core.scene.detector import psfs_on_detector
 from lnocl.core.scene.noise_check import measure_noise
 from lnocl.core.scene.observation import Observation
 from lnocl.core.scene.penalty import Penalty
-from lnocl.errors import counted, note
+from lnocl.errors import counted, note, warn
 from lnocl.process import ignored_notes, ignored_warnings
 
 # Places that a line names.
 MOST_NAMED = 3
 # Electrons per pixel that noise is of at least, and the share of stars that may be sharp.
 LEAST, MOST_STARS = 1e-3, 0.5
+
+
+def align_images(setup: Setup) -> tuple[Setup, str]:
+    """Return a setup with images moved to where their stars are, and that in words.
+
+    `lnocl.core.scene.registration` says by how much.
+    """
+    from lnocl.core.scene.registration import displacements, turned_otherwise
+
+    if others := [f"`images[{j}]`" for j in turned_otherwise(setup.observation, setup.stars)]:
+        warn(
+            f"the stars of {_first(others)} lie as if it were turned by as much the other way: "
+            "give its angle the other sign"
+        )
+        return setup, ""
+    moved = displacements(setup.observation, setup.stars)
+    named = [f"`images[{j}]` by ({x:+.2f}, {y:+.2f})" for j, (x, y) in enumerate(moved) if x or y]
+    if not named:
+        return setup, ""
+    words = f"{_first(named)} pixels, by {counted(len(setup.stars), 'star')}"
+    note(f"images moved: {words} (`mend_images` False leaves them)")
+    return replace(setup, observation=setup.observation.moved(moved)), words
 
 
 def mask_cores(setup: Setup) -> tuple[Setup, str]:

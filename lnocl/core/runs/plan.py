@@ -28,7 +28,8 @@ from lnocl.core.scene.stars import check_positions
 from lnocl.core.scene.zero_points import FEWEST
 from lnocl.core.solvers import SolverName
 
-CORES, RAYS, EXPOSURES, LEVELS, PSFS, HALOS, PRIOR, CHOICE, STARS = STEPS = (
+PLACES, CORES, RAYS, EXPOSURES, LEVELS, PSFS, HALOS, PRIOR, CHOICE, STARS = STEPS = (
+    "align images by their stars",
     "mask saturated cores",
     "mask cosmic rays",
     "fit exposures to stars",
@@ -80,6 +81,7 @@ WHOLE = Condition(lambda plan: not plan.in_tiles, "the images are divided into t
 
 # What each step needs, in the order in which reasons are given.
 NEEDS: dict[str, tuple[Condition, ...]] = {
+    PLACES: (AUTO, MENDS, HAS_STARS, SEVERAL, SHOWS_PSFS),
     CORES: (AUTO, MENDS, HAS_STARS),
     RAYS: (AUTO, MENDS),
     EXPOSURES: (AUTO, MENDS, HAS_STARS, SEVERAL, STEADY_STARS, NO_HALOS),
@@ -139,6 +141,7 @@ class Plan:
     >>> image[5, 8] += 100.0
     >>> obs = lnocl.Observation(np.stack([image] * 2), np.ones((3, 3)), epochs=[0, 1])
     >>> print(lnocl.plan(obs, [(8, 5)]))
+    align images by their stars: yes
     mask saturated cores: yes
     mask cosmic rays: yes
     fit exposures to stars: no, fewer than three stars may vary from epoch to epoch

@@ -11,7 +11,7 @@ import numpy as np
 
 from lnocl.core.runs.options import StopName
 from lnocl.core.runs.outcome import Mended, PsfRefinement
-from lnocl.core.runs.plan import CORES, EXPOSURES, LEVELS, PSFS, RAYS, Plan
+from lnocl.core.runs.plan import CORES, EXPOSURES, LEVELS, PLACES, PSFS, RAYS, Plan
 from lnocl.core.runs.start import Setup
 from lnocl.core.runs.steady import STEADY, steady_penalty
 from lnocl.core.scene.arrays import Array
@@ -101,6 +101,7 @@ def _mend_images(plan: Plan) -> tuple[Setup, dict[str, str]]:
     from lnocl.core.runs import mends  # which loads scipy
 
     steps = {
+        PLACES: mends.align_images,
         CORES: mends.mask_cores,
         RAYS: mends.mask_rays,
         EXPOSURES: mends.fit_exposures,

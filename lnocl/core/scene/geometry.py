@@ -118,6 +118,11 @@ class Geometry:
             return positions + self.offsets[j]
         return np.asarray(positions @ self.turns[j].T + self.offsets[j])
 
+    def moved(self, by: Array) -> Geometry:
+        """Return that of images moved by so many of their pixels, shape (p, 2)."""
+        maps = self.maps + _maps(np.zeros_like(self.turns), by)
+        return replace(self, maps=maps, offsets=self.offsets + by)
+
     def shows(self, positions: Array) -> NDArray[np.bool_]:
         """Return which positions, shape (n, 2), lie within any image."""
         places = np.stack([self.places(j, positions) for j in range(len(self.turns))], axis=1)

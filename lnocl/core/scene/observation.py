@@ -486,6 +486,10 @@ class Observation:
                 changes[name] = geometry.turned(values, fill, field.of_images)
         return self._with(changes)._closed()
 
+    def moved(self, by: Array) -> Observation:
+        """Return the observation with each image moved by so many of its pixels, shape (p, 2)."""
+        return self._with({"geometry": self.geometry.moved(by)})._closed()
+
     def as_given(self, images: NDArray[Any], cut: bool = True) -> NDArray[Any]:
         """Return images (p, ny, nx) of `upright` in the orientation of those given.
 

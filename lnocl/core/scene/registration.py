@@ -1,0 +1,136 @@
+r"""Where images lie by their stars, beside where their offsets and angles put them.
+
+An image less its background, seen back through its PSF P, tells at each pixel how bright a star
+there would be over its noise, but for a factor,
+
+.. math:: C = \frac{P \star w (g - b)}{\sqrt{P^2 \star w}},
+
+w being 0 at bad pixels. A misplaced image has all its stars moved alike, so that the squares of C
+at these are summed for each move. It is moved by the nearest maximum of the sum that is no side
+lobe of a brighter one. What the image that the sky's pixels are of needs too is no error of places
+of images, but of stars.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.ndimage import map_coordinates, maximum_filter
+from scipy.signal import fftconvolve
+
+from lnocl.core.scene.arrays import Array
+from lnocl.core.scene.detector import psfs_on_detector
+from lnocl.core.scene.observation import Observation
+
+# Images are sought so many pixels round their places; less than the other is left to the fit of
+# PSFs, which tells it better.
+REACH, LEAST = 30, 0.75
+SIDE = 2 * REACH + 1
+# A maximum is no side lobe where it is so many times as high as one. It is that of stars where it
+# is this share of the highest, or so many times the share that they have in the first image; the
+# highest is so many times its noise.
+APART, SHARE, ALIKE, SIGNIFICANT = 1.5, 0.2, 0.6, 30.0
+# The same where stars are expected to so many pixels: others may be brighter in one image.
+LEAST_SHARE, NEAR = 0.05, 2.0
+# Stars are so many times as bright at places of other angles where these are the right ones.
+CLEARLY = 1.1
+
+
+def displacements(observation: Observation, stars: Array) -> Array:
+    """Return how far each image lies from its place, pixels of its own, shape (p, 2).
+
+    That is 0 for the first image, for those that lie within `LEAST` of their places, and for those
+    whose stars do not tell.
+
+    Parameters
+    ----------
+    observation : Observation
+        Images and PSFs.
+    stars : ndarray of float64, shape (n, 2)
+        Places of stars on the sky, pixels.
+    """
+    psfs, moved = psfs_on_detector(observation), np.zeros((observation.n_images, 2))
+    first, share = _found(observation, 0, stars, psfs[0], moved[0], SHARE / ALIKE)
+    of_stars = np.linalg.solve(observation.turns[0], first)
+    for j in range(1, len(psfs) if np.isfinite(of_stars).all() else 0):
+        expected = observation.turns[j] @ of_stars
+        moved[j] = _found(observation, j, stars, psfs[j], expected, share)[0] - expected
+    moved[~(np.hypot(*moved.T) > LEAST)] = 0.0
+    return moved
+
+
+def _found(
+    observation: Observation, j: int, stars: Array, psf: Array, expected: Array, share: float
+) -> tuple[Array, float]:
+    """Return how far the stars of an image are from their places, and their share; NaN if unknown.
+
+    That is of the highest maximum, and is not much less than that which is given.
+    """
+    total, width = _total(_significance(observation, j, psf), observation.places(j, stars)), SIDE
+    y, x = np.indices(total.shape) - REACH
+    highest = row, column = divmod(int(np.argmax(total)), width)
+    rows, columns = (slice(width - 1 - i, 2 * width - 1 - i) for i in (row, column))
+    lobe = total[highest] * _lobes(psf, width)[rows, columns]
+    peaks = (total == maximum_filter(total, 3)) & (total > APART * lobe)
+    away = np.hypot(y - expected[1], x - expected[0])
+    peaks &= total > np.where(away < NEAR, LEAST_SHARE, ALIKE * share) * total[highest]
+    peaks[highest] = True
+    peaks[[0, -1]] = peaks[:, [0, -1]] = False  # which rise beyond
+    if not peaks.any() or total[highest] < SIGNIFICANT:
+        return np.full(2, np.nan), np.nan
+    nearest = np.argmin(np.where(peaks, away, np.inf))
+    row, column = divmod(int(nearest), width)
+    above, middle, below = total[row - 1 : row + 2, column].tolist()
+    left, _, right = total[row, column - 1 : column + 2].tolist()
+    finer = [_vertex(left, middle, right), _vertex(above, middle, below)]
+    found = np.array([column - REACH, row - REACH]) + finer
+    return found, float(total[row, column] / total[highest])
+
+
+def turned_otherwise(observation: Observation, stars: Array) -> list[int]:
+    """Return images whose stars lie as if they were turned by as much the other way."""
+    found = []
+    for j, psf in enumerate(psfs_on_detector(observation)):
+        places, turn = observation.places(j, stars), observation.turns[j]
+        if len(stars) > 1 and (turn != turn.T).any():
+            light = _significance(observation, j, psf)
+            others = places.mean(axis=0) + (stars - stars.mean(axis=0)) @ turn
+            lies, would_lie = (_total(light, each).max() for each in (places, others))
+            if would_lie > max(CLEARLY * lies, SIGNIFICANT):
+                found.append(j)
+    return found
+
+
+def _total(light: Array, places: Array) -> Array:
+    """Return the root of the sum of squares of C at the places of stars, for each move."""
+    y, x = np.indices((SIDE, SIDE)) - REACH
+    return np.sqrt(sum(map_coordinates(light, [y + at_y, x + at_x]) ** 2 for at_x, at_y in places))
+
+
+def _significance(observation: Observation, j: int, psf: Array) -> Array:
+    """Return C of an image over its noise, 0 where that is negative."""
+    good = (~observation.mask[j]).astype(np.float64)
+    background = np.broadcast_to(observation.background[j], good.shape)
+    light = good * (observation.images[j] - background)
+    noise = np.sqrt(max(float(np.median(observation.images[j][good > 0])), 1.0))
+    psf = np.pad(psf, [(0, 1 - n % 2) for n in psf.shape])[::-1, ::-1]
+    squares = fftconvolve(good, psf**2, "same").clip(min=(psf**2).sum() / 4.0)
+    return np.asarray(fftconvolve(light, psf, "same").clip(min=0.0) / (noise * np.sqrt(squares)))
+
+
+def _lobes(psf: Array, width: int) -> Array:
+    """Return the correlation of a PSF with itself, 1 in the middle, (2 width - 1, 2 width - 1)."""
+    own = fftconvolve(psf, psf[::-1, ::-1]) / (psf**2).sum()
+    lobes = np.zeros((2 * width - 1,) * 2)
+    halves = [(n // 2, width - 1) for n in own.shape]
+    of_own, of_all = (
+        tuple(slice(pair[k] - min(pair), pair[k] + min(pair) + 1) for pair in halves)
+        for k in (0, 1)
+    )
+    lobes[of_all] = own[of_own]
+    return lobes
+
+
+def _vertex(before: float, middle: float, after: float) -> float:
+    """Return where a parabola through three points has its maximum, from the middle one."""
+    bend = 2.0 * middle - before - after
+    return float(0.5 * (after - before) / bend) if bend > 0 else 0.0
