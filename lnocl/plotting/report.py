@@ -142,6 +142,9 @@ def _region(view: ResultView, region: Region, step: int) -> dict[str, Any]:
     top, corner = result.brightest(extended), _corner(there, view.shape, (0.0, 0.0))
     limits = 0.0, top, result.FAINT_SHARE * top
     source = _layer("extended source", block_means(extended, step), limits, corner, view.unit)
+    if view.doubtful is not None:
+        flags = block_means(view.doubtful[finer_slices(there, q)], q * step) >= 0.5
+        source["doubtful"] = {"png": _png(flags[::-1].astype(np.uint8))}
     turned = None
     if view.turns is not None:  # the map to each image, less the corner's shift
         shifts = [view.offset_at(j, region) for j in range(len(images))]

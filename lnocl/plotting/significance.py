@@ -19,6 +19,7 @@ from lnocl.plotting.figure import (
     as_text,
     extent_of,
     new_figure,
+    outlined,
     show_image,
 )
 
@@ -100,7 +101,8 @@ def _draw_signal(axis: Axes, view: SignificanceView) -> None:
         for chosen, marker in ((is_point, "o"), (~is_point, "s")):
             axis.plot(x[chosen], y[chosen], marker, ms=11, mfc="none", mec="k", mew=1.2)
         for i in range(min(n, MOST_NUMBERED)):
-            axis.annotate(f"{i + 1}", (x[i], y[i]), (6, 6), textcoords="offset points", fontsize=8)
+            style = {"textcoords": "offset points", "fontsize": 8, **outlined("black", "white")}
+            axis.annotate(f"{i + 1}", (x[i], y[i]), (6, 6), **style)
     what = "points" if not view.width else f"sources {view.width:g} pixels wide"
     title = f"{what}: {n} above {view.threshold:.2f}\ncircles: points; squares: perhaps extended"
     axis.set_title(title, fontsize=9)

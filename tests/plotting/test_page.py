@@ -28,11 +28,16 @@ def data_of(page):
     return json.loads(text)
 
 
-def decoded(layer):
-    """Return the values of a picture as the page's own script reads them; bad pixels are NaN."""
+def codes_of(layer):
+    """Return the codes of a picture, the first row below."""
     from PIL import Image
 
-    codes = np.array(Image.open(io.BytesIO(base64.b64decode(layer["png"]))))[::-1].astype(float)
+    return np.array(Image.open(io.BytesIO(base64.b64decode(layer["png"]))))[::-1]
+
+
+def decoded(layer):
+    """Return the values of a picture as the page's own script reads them; bad pixels are NaN."""
+    codes = codes_of(layer).astype(float)
     step = (codes - 1) / 254
     low, high, scale = layer["low"], layer["high"], layer["scale"]
     if scale:
@@ -72,6 +77,18 @@ def test_the_offset_of_an_image_moves_its_corner():
     zoom = data_of(make_report(view, "a"))["regions"][1]
     assert (zoom["images"][1][0]["x"], zoom["images"][1][0]["y"]) == (16.0, 6.0)
     assert (zoom["source"]["x"], zoom["source"]["y"]) == (16, 6)
+
+
+@pytest.mark.parametrize("oversample", [1, 2])
+def test_what_errors_of_the_psf_may_fake_is_outlined(oversample):
+    doubtful = np.zeros((60 * oversample, 70 * oversample), bool)
+    doubtful[20 * oversample : 30 * oversample, 5 * oversample : 9 * oversample] = True
+    view = make_view(p=0, doubtful=doubtful, extended=1.0 * doubtful, oversample=oversample)
+    for region in data_of(make_report(view, "a"))["regions"]:
+        light = decoded(region["source"])
+        np.testing.assert_array_equal(codes_of(region["source"]["doubtful"]) == 1, light > 0)
+        assert light.any()
+    assert "doubtful" not in data_of(make_report(make_view(p=0), "a"))["regions"][0]["source"]
 
 
 def test_stars_of_a_turned_image_are_where_it_sees_them():

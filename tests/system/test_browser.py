@@ -1,5 +1,6 @@
 """The page of a result in a real browser, without a network: pictures, blink, stretch, keys."""
 
+import dataclasses
 import re
 from pathlib import Path
 
@@ -32,6 +33,9 @@ def page(browser, tmp_path):
     bright = 4000.0 * np.exp(-((x - 10) ** 2 + (y - 20) ** 2) / 8.0)
     view.models[:] += bright
     view.images[:] = view.models + np.sqrt(view.models) * view.residuals
+    doubtful = np.zeros(view.extended.shape, bool)
+    doubtful[30:40, 30:40] = True
+    view = dataclasses.replace(view, doubtful=doubtful)
     path = tmp_path / "report.html"
     path.write_text(make_report(view, "a jet", ["the model fits"], {"Stars": TABLE}))
     browser.get(path.as_uri())
@@ -99,6 +103,15 @@ def test_each_button_shows_its_picture_and_the_first_shows_all(page):
     assert len(set(shown.values())) == 4
     everything.click()
     wait_for(page, lambda: page.execute_script(row) == LAYERS)
+
+
+def test_what_errors_of_the_psf_may_fake_is_outlined_in_red(page):
+    page.find_elements("css selector", "#layers button")[4].click()
+    wait_for(page, lambda: layer(page) == "extended source")
+    red, green, blue = colour(page, 30 - 0.45, 35)
+    assert red > 2 * max(green, blue)
+    red, green, blue = colour(page, 35, 35)
+    assert red < 2 * max(green, blue)
 
 
 def test_axes_and_colour_bars_have_round_numbers(page):
