@@ -49,14 +49,12 @@ def report(path: str) -> str:
     header = (each for each in saved.header.cards if each.keyword not in LEFT_OUT)
     cards = [(each.keyword, each.value, each.comment) for each in header]
     parts, view = read_parts(path, (*TABLES, "SIGNAL", "LIMIT50")), view_of(saved)
-    tables = {
-        name.capitalize(): table_of(name, parts[name], saved)
-        for name in TABLES
-        if name in parts and (name != "STARS" or saved.stars)
-    }
+    made = {name: table_of(name, parts[name], saved) for name in TABLES if name in parts}
+    # Of a search it is told that nothing was found; others without rows have nothing to tell.
+    tables = {name.capitalize(): made[name] for name in made if made[name] or name == "DETECTIONS"}
     found = _found(path, view, parts)
-    made = saved.messages, tables, cards, saved.commands(), found, arcseconds(saved)
-    return make_report(view, title, *made)
+    given = saved.messages, tables, cards, saved.commands(), found, arcseconds(saved)
+    return make_report(view, title, *given)
 
 
 def _found(path: str, view: ResultView, parts: Mapping[str, Content]) -> SignificanceView | None:

@@ -95,7 +95,7 @@ def test_stars_of_a_turned_image_are_where_it_sees_them():
     turn = np.array([[0.0, -1.0], [1.0, 0.0]])
     view = make_view(p=2, stars=[(40.0, 30.0), (45.0, 33.0)], star_fluxes=np.ones(2),
                      turns=np.array([np.eye(2), turn]),
-                     offsets=np.array([[0.0, 0.0], [70.0, -10.0]]))  # fmt: skip
+                     offsets=np.array([[0.0, 0.0], [73.0, -12.0]]))  # fmt: skip
     region = data_of(make_report(view, "a"))["regions"][1]
     layer, turned = region["images"][1][0], np.array(region["turned"][1])
     places = [turned @ (*star, 1.0) for star in view.stars]
@@ -263,6 +263,13 @@ class TestCommand:
         assert "<td>ring</td><td>4.00</td><td>50.0 ± 3.0</td><td>adu</td></tr>" in page
         assert "<td>star 1 flux</td><td>8.0 ± 2.0</td><td>adu</td></tr>" in page
         assert "jet flux" not in page  # a slice of a profile, which is drawn
+        names = "x", "y", "flux", "kind"
+        empty = {"REGIONS": [Column("name", np.array([], "U4"))],
+                 "DETECTIONS": [Column(name, np.zeros(0)) for name in names]}  # fmt: skip
+        fitswrite.write_result("none.fits", np.ones((16, 16)), [], [], empty)
+        page = reports.report("none.fits")
+        assert re.findall("<h2>(.*?)</h2>", page)[2:] == ["Detections", "How to make it again"]
+        assert "<h2>Detections</h2><p>None.</p>" in page  # they were looked for
 
     @pytest.mark.parametrize("oversample", [1, 2])
     def test_axes_of_images_with_coordinates_are_in_arcsec(self, oversample):
