@@ -45,9 +45,9 @@ OPTIONS = {
         option(
             "--residuals",
             action="store_true",
-            help="add two cubes: RESIDUALS of each image, (image - model) / sqrt(model), and "
-            "MODELS, in electrons; their headers have the coordinates of the image where all "
-            "images share them, else their offsets",
+            help="add cubes: RESIDUALS of each image, (image - model) / sqrt(model), and MODELS, "
+            "in electrons, whose headers have the coordinates of the image where all images share "
+            "them, else their offsets; and ELECTRONS, those in one unit of the result",
         ),
         options.PICTURE.but(
             help="picture of image, model, residuals and extended source, whole and at each star, "

@@ -7,7 +7,7 @@ import contextlib
 import dataclasses
 import re
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -216,14 +216,13 @@ def _table_of(regions: Sequence[Aperture], measured: QTable) -> QTable:
     """Return the regions, which are measured last, as a table: name, area, centre and flux."""
     from astropy.table import QTable
 
-    columns: dict[str, list[Any]] = {name: [] for name in ("name", "pixels", "x", "y")}
-    for each in regions:
-        y, x = each.places
-        columns["name"].append(each.name)
-        columns["pixels"].append(each.n_pixels)
-        columns["x"].append((each.weights * x).sum() / each.n_pixels)
-        columns["y"].append((each.weights * y).sum() / each.n_pixels)
-    table = QTable(columns, dtype=(str, float, float, float))
+    means = [
+        [each.n_pixels, *(np.average(axis, weights=each.weights) for axis in each.places[::-1])]
+        for each in regions
+    ]
+    columns = [np.array([each.name for each in regions], str), *np.reshape(means, (-1, 3)).T]
+    units = {"x": "pix", "y": "pix"}
+    table = QTable(columns, names=("name", "pixels", "x", "y"), units=units)
     of_regions = measured[len(measured) - len(regions) :]
     table["flux"] = of_regions["value"] - of_regions["bias"]
     for name in ("error", "share", "unit", "note"):

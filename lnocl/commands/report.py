@@ -24,20 +24,20 @@ OPTIONS = [
 
 def _run(arguments: argparse.Namespace) -> Iterator[str]:
     from lnocl.io import atomic
-    from lnocl.studies import figures
+    from lnocl.studies import reports
 
     if not arguments.output.lower().endswith((".html", ".htm")):
         raise InputError(
             f"the report is a page of HTML; give it a name ending in .html, not {arguments.output}"
         )
     atomic.check_output(arguments.output, arguments.overwrite)
-    page = figures.report(arguments.result)
+    page = reports.report(arguments.result)
     atomic.write_text(arguments.output, page, arguments.overwrite)
     yield f"written to {arguments.output}: open it in a browser"
 
 
 COMMAND = Command(
-    "write a result as one page of HTML: images to blink and stretch, tables, messages of the run",
+    "write a result as one page of HTML: whether to trust it, pictures to blink, all its tables",
     {"": OPTIONS},
     _run,
 )

@@ -52,6 +52,8 @@ PARTS = {
     "HELDOUT": Part(("smoothing", "iteration", "error")),
     "MODELS": Part(pixels="f4", place=IMAGES, unit="electron"),
     "RESIDUALS": Part(pixels="f4", place=IMAGES),
+    # Electrons in one unit of the result, in each image or in each of its pixels.
+    "ELECTRONS": Part(pixels="f4"),
     "PSFFIT": Part(("image",)),
     "PSFS": Part(pixels="f8"),
     "PSFERRORS": Part(("from", "to", "error")),

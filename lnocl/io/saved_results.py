@@ -22,7 +22,7 @@ from lnocl.io.selection import has_pixels
 Columns = dict[str, NDArray[np.float64]]
 
 TABLES = "STARS", "HALOS", "HISTORY", "CURVE", "HELDOUT"
-CUBES = ("MODELS", "RESIDUALS")
+CUBES = ("MODELS", "RESIDUALS", "ELECTRONS")
 READ = *TABLES, *CUBES, "DOUBTFUL", "MESSAGES", "EPOCHS"
 # Words of a shell with bytes that FITS does not allow, as `fitswrite.history_lines` writes them.
 QUOTED = re.compile(r"\$'((?:[^'\\]|\\.)*)'")
@@ -43,7 +43,8 @@ class SavedResult:
     tables : dict of str to dict of str to ndarray of float64
         Columns of the tables `TABLES` that are there; ``STARS`` always is.
     cubes : dict of str to ndarray of float64, shape (p, ny, nx)
-        ``MODELS`` and ``RESIDUALS``, where both are there.
+        ``MODELS``, ``RESIDUALS`` and ``ELECTRONS``, where all are there; the last may have the
+        shape (p, 1, 1).
     offsets : ndarray of float64, shape (p, 2)
         Of the images, pixels; 0 where the cubes have none.
     turns : ndarray of float64, shape (p, 2, 2), or None
@@ -149,7 +150,7 @@ def read_result(path: str) -> SavedResult:
     labels = found["EPOCHS"]["label"].tolist() if "EPOCHS" in found else []
     if fault := _fault(extended, tables, cubes, doubtful, oversample, len(labels)):
         raise no_result(path, fault)
-    cards = readable(parts[CUBES[-1]].header) if cubes else fits.Header()
+    cards = readable(parts["RESIDUALS"].header) if cubes else fits.Header()
     p = len(cubes["MODELS"]) if cubes else 0
     offsets = [
         [number(path, cards, f"OFF{axis}{j}") or 0.0 for axis in "XY"] for j in range(1, p + 1)
@@ -195,11 +196,8 @@ def _fault(
     if oversample not in OVERSAMPLES or any(n % oversample for n in extended.shape):
         return f"OVERSAMP is {oversample:g}"
     for name, cube in cubes.items():
-        if (
-            cube.ndim != 3
-            or (oversample * cube.shape[1], oversample * cube.shape[2]) != extended.shape
-            or cube.shape != cubes[CUBES[0]].shape
-        ):
+        shape = len(cubes["MODELS"]), *(int(n // oversample) for n in extended.shape)
+        if cube.shape != shape and (name, cube.shape) != ("ELECTRONS", (*shape[:1], 1, 1)):
             return f"{name} has the shape {cube.shape}"
     if doubtful is not None and doubtful.shape != extended.shape:
         return f"DOUBTFUL has the shape {doubtful.shape}"

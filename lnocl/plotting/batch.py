@@ -4,15 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from lnocl.io.saved_results import read_result
-from lnocl.plotting.figure import as_text, extent_of, new_figure, show_image
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+from lnocl.plotting.figure import Figure, as_text, extent_of, new_figure, show_image
 
 # Pixels of a picture, along its longer side; more cannot be told apart on a page.
 SIDE = 128

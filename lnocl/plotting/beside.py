@@ -3,19 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
-from lnocl.plotting.figure import as_text, new_figure
+from lnocl.plotting.figure import Figure, as_text, new_figure
 from lnocl.plotting.result import Region, ResultView, brightest, draw_extended, finer_slices
 
 
 def draw_beside(views: Mapping[str, ResultView]) -> Figure:
-    """Draw the extended sources of several results beside each other, all on one stretch.
+    """Draw the extended sources of several results beside each other, on one stretch for a unit.
 
     It is that of the faintest, so that a star which is a part of one does not hide the others.
 
@@ -41,11 +37,11 @@ def draw_beside(views: Mapping[str, ResultView]) -> Figure:
     figure = new_figure(max(3.0 * len(views), 6.0), 2.9 * len(regions))
     axes = figure.subplots(len(regions), len(views), squeeze=False)
     for row, region in zip(axes, regions, strict=True):
-        shown = (
-            view.extended[finer_slices(region.slices(view.shape), view.oversample)]
-            for view in views.values()
-        )
-        top = min((brightest(each) for each in shown if each.any()), default=1.0)
+        tops: dict[str, float] = {}
+        for view in views.values():
+            there = view.extended[finer_slices(region.slices(view.shape), view.oversample)]
+            if there.any():
+                tops[view.unit] = min(brightest(there), tops.get(view.unit, np.inf))
         for axis, (name, view) in zip(row, views.items(), strict=True):
-            draw_extended(axis, view, region, as_text(name), top)
+            draw_extended(axis, view, region, as_text(name), tops.get(view.unit, 1.0))
     return figure

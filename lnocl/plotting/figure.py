@@ -16,6 +16,8 @@ if TYPE_CHECKING:
     from matplotlib.colors import Normalize
     from matplotlib.figure import Figure
     from matplotlib.image import AxesImage
+else:  # for the modules beside this one; matplotlib may be missing
+    Axes = Figure = Any
 
 
 DPI = 110
@@ -119,6 +121,13 @@ def extent_of(shape: Sequence[int], finer: int = 1) -> tuple[float, float, float
 def line_style(i: int) -> dict[str, Any]:
     """Return colour and style of the i-th line; they begin again after the last."""
     return {"color": COLOURS[i % len(COLOURS)], "linestyle": STYLES[i % len(STYLES)]}
+
+
+def outlined(colour: str, edge: str) -> dict[str, Any]:
+    """Return the style of text that is read on any image: a colour, and that of its edge."""
+    from matplotlib.patheffects import withStroke
+
+    return {"color": colour, "path_effects": [withStroke(linewidth=2.0, foreground=edge)]}
 
 
 def as_text(words: str) -> str:

@@ -4,16 +4,13 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lnocl.core.scene.arrays import Array
-from lnocl.plotting.figure import MOST_STARS, as_text, line_style
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
+from lnocl.plotting.figure import MOST_STARS, Axes, as_text, line_style
 
 # Labels of epochs that an axis has room for.
 MOST_LABELS = 8
@@ -68,14 +65,8 @@ def draw(axis: Axes, curves: LightCurves) -> None:
     for i, s in enumerate(shown[means[shown] > 0]):
         flux, error = curves.fluxes[s] / means[s], curves.errors[s] / means[s]
         style = line_style(i) | {"lw": 0.8, "marker": "o", "ms": 3}
-        axis.errorbar(
-            epochs,
-            flux,
-            np.nan_to_num(error),
-            capsize=2,
-            label=f"star {s + 1}, mean {means[s]:.4g} {as_text(curves.unit)}",
-            **style,
-        )
+        label = f"star {s + 1}, mean {means[s]:.4g} {as_text(curves.unit)}"
+        axis.errorbar(epochs, flux, np.nan_to_num(error), capsize=2, label=label, **style)
     axis.set_title("light curves", fontsize=9)
     axis.set_ylabel("flux / mean", fontsize=9)
     _mark(axis, epochs, curves.labels)

@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
-from lnocl.plotting.figure import COLOURS, as_text, new_figure
+from lnocl.plotting.figure import COLOURS, Figure, as_text, new_figure
 
 
 def draw_bands(name: str, flux: Mapping[str, Any], width: Mapping[str, Any], unit: str) -> Figure:

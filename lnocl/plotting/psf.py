@@ -3,17 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
-
 from lnocl.core.scene.arrays import Array
-from lnocl.plotting.figure import COLOURS, line_style, new_figure, show_image
+from lnocl.plotting.figure import COLOURS, Axes, Figure, line_style, new_figure, show_image
 
 # Share of a PSF's peak at which its stretch ends.
 PSF_FLOOR = 1e-4
@@ -96,10 +92,8 @@ def _draw_middle(axis: Axes, psf: Array) -> None:
     """Draw row and column of a PSF through its middle."""
     side = len(psf)
     at = np.arange(side) - side // 2
-    for i, (values, name) in enumerate(
-        ((psf[side // 2], "along x"), (psf[:, side // 2], "along y"))
-    ):
-        axis.plot(at, values / psf.max(), **line_style(i), label=name)
+    for i, along in enumerate((psf, psf.T)):
+        axis.plot(at, along[side // 2] / psf.max(), **line_style(i), label=f"along {'xy'[i]}")
     axis.set_yscale("symlog", linthresh=PSF_FLOOR)
     axis.axvline(0, color="0.4", lw=1, ls=":")
     axis.set_title("PSF through its centre", fontsize=11)

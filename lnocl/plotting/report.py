@@ -7,33 +7,22 @@ import html
 import io
 import json
 import math
-from collections.abc import Mapping, Sequence
+import re
+from collections.abc import Callable, Mapping, Sequence
 from importlib.resources import files
 from string import Template
-from typing import TYPE_CHECKING, Any
+from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lnocl.core.scene.arrays import Array
 from lnocl.notebook import block_means
-from lnocl.plotting.figure import COLOUR_MAP, new_figure, png_of
-from lnocl.plotting.result import (
-    FAINT_SHARE,
-    MAX_SIGMA,
-    Region,
-    ResultView,
-    brightest,
-    draw_choice,
-    draw_light_curves,
-    finer_slices,
-    image_limits,
-    worst_image,
-)
+from lnocl.plotting import light_curves, result
+from lnocl.plotting.figure import COLOUR_MAP, Axes, Figure, new_figure, png_of
+from lnocl.plotting.result import Region, ResultView, finer_slices
 from lnocl.plotting.significance import SignificanceView, draw_significance
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 # Bytes of the whole frame's pictures, about: an image and its residuals are noise, of a byte a
 # pixel each, a model takes a third, the extended source a half; in base64 four for three.
@@ -44,15 +33,19 @@ HALF = 24
 # Codes of a pixel: 0 is bad, the others are steps.
 STEPS = 254
 
+# Cells of a table by the heads of its columns, with units.
+Table = Mapping[str, Sequence[str]]
+
 
 def make_report(
     view: ResultView,
     title: str,
     messages: Sequence[str] = (),
-    stars: Mapping[str, Sequence[float]] | None = None,
+    tables: Mapping[str, Table] = MappingProxyType({}),
     cards: Sequence[tuple[str, Any, str]] = (),
     commands: str = "",
     found: SignificanceView | None = None,
+    arcseconds: Array | None = None,
 ) -> str:
     """Return a page with images to blink and stretch, messages of the run, tables and the command.
 
@@ -65,14 +58,16 @@ def make_report(
     messages : sequence of str, optional
         The answer of the run; after an empty line its warnings, which begin with "warning: ", and
         what was measured and chosen.
-    stars : mapping of str to sequence of float, optional
-        Columns of the table of stars.
+    tables : mapping of str to mapping of str to sequence of str, optional
+        Columns of tables by the titles of their sections; figures are with those of their titles.
     cards : sequence of (keyword, value, comment), optional
         Header cards.
     commands : str, optional
         Commands that repeat the run.
     found : SignificanceView, optional
         Detections and limits.
+    arcseconds : ndarray of float64, shape (2, 2), optional
+        How far east and north a pixel along x and one along y lead.
 
     Raises
     ------
@@ -85,26 +80,30 @@ def make_report(
     data = {
         "regions": [_region(view, region, 1 if region.middle else step) for region in regions],
         "stars": [[round(x, 3), round(y, 3)] for x, y in view.stars],
-        "first": worst_image(view, regions[0]) if len(view.images) else 0,
+        "first": result.worst_image(view, regions[0]) if len(view.images) else 0,
         "palettes": {"source": _palette(COLOUR_MAP), "residuals": _palette("RdBu_r")},
+        "arcseconds": None if arcseconds is None else arcseconds.tolist(),
     }
-    notes = [f"The whole frame is shown in blocks of {step} x {step} pixels."] if step > 1 else []
-    if view.oversample > 1:
-        notes.append(
-            "The extended source is finer: shown is its light in each pixel of the images."
-        )
-    if not len(view.images):
-        notes.append("The file has no models and residuals: repeat the run with both.")
+    notes = {
+        f"The whole frame is shown in blocks of {step} x {step} pixels.": step > 1,
+        "The extended source is finer: shown is its light in each pixel of the images.": (
+            view.oversample > 1
+        ),
+        "The file has no models and residuals: repeat the run with both.": not len(view.images),
+    }
+    figures = {"Stars": _drawn(light_curves.draw, view.light_curves)} if view.light_curves else {}
+    if found is not None and (found.signal is not None or found.limit is not None):
+        figures["Detections" if "Detections" in tables else "Limits"] = draw_significance(found)
+    choice = _drawn(result.draw_choice, view) if view.held_out or view.history else None
     template = Template((files("lnocl.plotting") / "report.html").read_text("utf-8"))
     return template.substitute(
         title=html.escape(title),
         messages=_said(messages),
-        stars=_table(stars or {}, "star"),
-        found=_found(found),
-        curve=_curve(view),
+        sections="".join(_section(each, figures.get(each), tables[each]) for each in tables),
+        choice=_section("How the iteration was chosen", choice),
         commands=html.escape(commands),
-        cards=_cards(cards),
-        note=html.escape(" ".join(notes)),
+        cards=_table([], [[str(cell) for cell in card] for card in cards]),
+        note=" ".join(note for note, holds in notes.items() if holds),
         data=json.dumps(data, allow_nan=False).replace("<", "\\u003c"),
     )
 
@@ -126,29 +125,32 @@ def _region(view: ResultView, region: Region, step: int) -> dict[str, Any]:
         if not view.images[j][there].size:  # not in this image
             images.append([])
             continue
-        low, high, _ = image_limits(view.images[j][there])
-        scale = image_limits(view.images[j])[2]
-        limits = (low, high, scale)
-        residuals = step * block_means(view.residuals[j][there], step)  # still over their noise
+        scale = result.image_limits(view.images[j])[2]
+        light = (*result.image_limits(view.images[j][there])[:2], scale), corner, view.unit
+        noise = (-result.MAX_SIGMA, result.MAX_SIGMA, 0.0), corner, "sigma"
+        layers = (
+            ("image", view.images[j], light),
+            ("model", view.models[j], light),
+            ("residuals", step * view.residuals[j], noise),  # of blocks over their noise
+        )
         images.append(
-            [
-                _layer("image", block_means(view.images[j][there], step), limits, corner),
-                _layer("model", block_means(view.models[j][there], step), limits, corner),
-                _layer("residuals", residuals, (-MAX_SIGMA, MAX_SIGMA, 0.0), corner, "sigma"),
-            ]
+            [_layer(name, block_means(each[there], step), *how) for name, each, how in layers]
         )
     there, q = region.slices(view.shape), view.oversample
     # Of a finer sky the light in each pixel of the images.
     extended = q**2 * block_means(view.extended[finer_slices(there, q)], q)
-    top = brightest(extended)
-    source = _layer(
-        "extended source",
-        block_means(extended, step),
-        (0.0, top, FAINT_SHARE * top),
-        _corner(there, view.shape, (0.0, 0.0)),
-        view.unit,
-    )
-    return {"name": region.name, "step": step, "images": images, "source": source}
+    top, corner = result.brightest(extended), _corner(there, view.shape, (0.0, 0.0))
+    limits = 0.0, top, result.FAINT_SHARE * top
+    source = _layer("extended source", block_means(extended, step), limits, corner, view.unit)
+    if view.doubtful is not None:
+        flags = block_means(view.doubtful[finer_slices(there, q)], q * step) >= 0.5
+        source["doubtful"] = {"png": _png(flags[::-1].astype(np.uint8))}
+    turned = None
+    if view.turns is not None:  # the map to each image, less the corner's shift
+        shifts = [view.offset_at(j, region) for j in range(len(images))]
+        turned = np.dstack([view.turns, view.offsets - shifts]).tolist()
+    found = {"images": images, "source": source, "turned": turned}
+    return {"name": region.name, "step": step, **found}
 
 
 def _corner(there: Any, shape: Sequence[int], offset: Sequence[float]) -> tuple[float, float]:
@@ -158,11 +160,7 @@ def _corner(there: Any, shape: Sequence[int], offset: Sequence[float]) -> tuple[
 
 
 def _layer(
-    name: str,
-    values: Array,
-    limits: tuple[float, float, float],
-    corner: tuple[float, float],
-    unit: str = "electron",
+    name: str, values: Array, limits: Sequence[float], corner: Sequence[float], unit: str
 ) -> dict[str, Any]:
     """Return a picture and how its pixels are read; a scale of 0 is linear, else they are asinh."""
     low, high, scale = limits
@@ -171,17 +169,8 @@ def _layer(
         steepness = (high - low) / scale
         shares = np.arcsinh(shares * steepness) / np.arcsinh(steepness)
     codes = np.where(np.isfinite(shares), 1 + np.round(STEPS * np.nan_to_num(shares)), 0)
-    return {
-        "name": name,
-        "palette": "residuals" if name == "residuals" else "source",
-        "unit": unit,
-        "png": _png(codes[::-1].astype(np.uint8)),
-        "low": low,
-        "high": high,
-        "scale": scale,
-        "x": corner[0],
-        "y": corner[1],
-    }
+    read = dict(zip(("low", "high", "scale", "x", "y"), (*limits, *corner), strict=True))
+    return {"name": name, "unit": unit, **read, "png": _png(codes[::-1].astype(np.uint8))}
 
 
 def _png(codes: NDArray[np.uint8]) -> str:
@@ -200,28 +189,20 @@ def _palette(name: str) -> str:
     return base64.b64encode(colours.tobytes()).decode("ascii")
 
 
-def _curve(view: ResultView) -> str:
-    n = 2 if view.light_curves else 1
-    figure = new_figure(8.5, 3.0 * n)
-    axes = figure.subplots(n, squeeze=False)[:, 0]
-    draw_choice(axes[0], view)
-    if n > 1:
-        draw_light_curves(axes[1], view)
-    return _picture(figure)
-
-
-def _picture(figure: Figure) -> str:
-    return base64.b64encode(png_of(figure)).decode("ascii")
-
-
 def _said(lines: Sequence[str]) -> str:
-    """Return the answer of a run, its warnings, and a list to unfold of all else."""
+    """Return whether to trust a result, its answer, its warnings, and a list to unfold of more."""
     if not lines:
         return "<p>The file does not hold it.</p>"
     end = list(lines).index("") if "" in lines else len(lines)
+    trusted = re.split(r"^trust +(.*(?:\n .*)*)\n?", "\n".join(lines[:end]), flags=re.MULTILINE)
+    before, trust, after = [*trusted, "", ""][:3]
     warned = [line for line in lines[end + 1 :] if line.startswith("warning: ")]
     more = [line for line in lines[end + 1 :] if line not in warned]
-    parts = [f"<pre>{html.escape(chr(10).join(lines[:end]))}</pre>", _list(warned, "warning")]
+    parts = [
+        _list([line.strip() for line in trust.splitlines()], "trust"),
+        f"<pre>{html.escape(before + after)}</pre>",
+        _list([each for each in warned if each.removeprefix("warning: ") not in trust], "warning"),
+    ]
     if more:
         summary = "What was measured and chosen"
         parts.append(f"<details><summary>{summary}</summary>{_list(more)}</details>")
@@ -233,41 +214,29 @@ def _list(lines: Sequence[str], kind: str = "") -> str:
     return f"<ul class='{kind}'>{items}</ul>" if lines else ""
 
 
-def _found(view: SignificanceView | None) -> str:
-    """Return the section of detections and limits; nothing where the file has none."""
-    if view is None:
-        return ""
-    parts = ["<h2>Detections and limits</h2>"]
-    if view.signal is not None or view.limit is not None:
-        picture = _picture(draw_significance(view))
-        parts.append(
-            f'<img alt="detections and limits" src="data:image/png;base64,{picture}" '
-            'style="max-width:100%">'
-        )
-    if view.detections is not None:
-        parts.append(_table(view.detections, "detection"))
-    if view.curves is not None:
-        rows = _table(view.curves, "ring")
-        parts.append(f"<details><summary>Limits round each star</summary>{rows}</details>")
-    return "\n".join(parts)
+def _drawn(draw: Callable[[Axes, Any], None], what: Any) -> Figure:
+    figure = new_figure(8.5, 3.0)
+    draw(figure.subplots(), what)
+    return figure
 
 
-def _table(columns: Mapping[str, Sequence[Any]], what: str) -> str:
-    n = len(next(iter(columns.values()), ()))
-    if not n:
-        return "<p>None.</p>"
-    head = "".join(f"<th>{html.escape(name)}</th>" for name in (what, *columns))
-    rows = (
-        "".join(f"<td>{cell}</td>" for cell in (s + 1, *(_cell(c[s]) for c in columns.values())))
-        for s in range(n)
+def _section(title: str, figure: Figure | None, table: Table | None = None) -> str:
+    """Return a heading with a figure and a table below it; nothing where there is neither."""
+    shown = f"<h2>{title}</h2>" if figure or table is not None else ""
+    if figure is not None:
+        picture = base64.b64encode(png_of(figure)).decode("ascii")
+        shown += f'<div class="box"><img alt="{title}" src="data:image/png;base64,{picture}"></div>'
+    if table is not None:
+        rows = list(zip(*table.values(), strict=True))
+        shown += _table([tuple(table)], rows) if rows else "<p>None.</p>"
+    return shown
+
+
+def _table(head: Sequence[Sequence[str]], rows: Sequence[Sequence[str]]) -> str:
+    """Return a table in a box of its own, in which it may be wider than the page."""
+    cells = "".join(
+        f"<tr>{''.join(f'<{kind}>{html.escape(cell)}</{kind}>' for cell in row)}</tr>"
+        for kind, lines in (("th", head), ("td", rows))
+        for row in lines
     )
-    return f"<table><tr>{head}</tr>{''.join(f'<tr>{row}</tr>' for row in rows)}</table>"
-
-
-def _cell(value: Any) -> str:
-    return html.escape(value) if isinstance(value, str) else f"{value:.7g}"
-
-
-def _cards(cards: Sequence[tuple[str, Any, str]]) -> str:
-    rows = ("".join(f"<td>{html.escape(str(cell))}</td>" for cell in card) for card in cards)
-    return f"<table>{''.join(f'<tr>{row}</tr>' for row in rows)}</table>"
+    return f'<div class="box"><table>{cells}</table></div>'

@@ -4,14 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 from lnocl.core.scene.arrays import Array
 from lnocl.plotting import light_curves
@@ -19,9 +15,12 @@ from lnocl.plotting.figure import (
     COLOUR_MAP,
     MOST_NUMBERED,
     MOST_STARS,
+    Axes,
+    Figure,
     as_text,
     line_style,
     new_figure,
+    outlined,
     show_image,
 )
 from lnocl.plotting.light_curves import LightCurves
@@ -30,6 +29,8 @@ from lnocl.plotting.light_curves import LightCurves
 MAX_SIGMA = 5.0
 # An extended source is shown down to this share of its brightest pixel, nearly logarithmically.
 FAINT_SHARE = 3e-3
+# So many stars are targets: the first, as those named one by one come before those of a table.
+TARGETS = 3
 # What red lines are.
 OUTLINED = "red: perhaps the PSF's error alone"
 
@@ -43,7 +44,7 @@ class ResultView:
     Attributes
     ----------
     extended : ndarray of float64
-        Extended source: pixels of the images, or finer ones.
+        Extended source: pixels of the images, or finer ones. All light is in one unit.
     stars : sequence of (x, y)
         Positions, pixels of the images.
     star_fluxes : ndarray of float64, shape (n,)
@@ -62,7 +63,7 @@ class ResultView:
     doubtful : ndarray of bool, shape (ny, nx), or None
         Pixels to outline, where errors of the PSFs may have faked what is there.
     unit : str
-        Unit of the extended source, per pixel of it.
+        That of the extended source, the images and the models, per pixel of each.
     oversample : int
         Pixels of the extended source to one of the images, along each axis.
     turns : ndarray of float64, shape (p, 2, 2), or None
@@ -106,9 +107,10 @@ class ResultView:
         return ny // self.oversample, nx // self.oversample
 
     def zooms(self) -> list[int]:
-        """Return the stars to enlarge: the brightest, in the order that they have."""
-        brightest = np.argsort(-np.asarray(self.star_fluxes), kind="stable")[:MOST_STARS]
-        return sorted(brightest.tolist())
+        """Return the stars to enlarge, in their order: the first, and the brightest of others."""
+        is_other = np.arange(len(self.stars)) >= TARGETS
+        order = np.lexsort((-np.asarray(self.star_fluxes), is_other))
+        return sorted(order[:MOST_STARS].tolist())
 
     def half(self) -> int:
         """Return half the side of an enlarged region, pixels."""
@@ -155,10 +157,11 @@ def draw_result(view: ResultView) -> Figure:
     Returns
     -------
     matplotlib.figure.Figure
-        A row for the whole frame and one for each of the six brightest stars: image, model,
-        residuals and extended source. With several images, each row shows that whose residuals are
-        largest there. Below them the errors that held-out counts estimate, or else the objective;
-        and light curves of the stars where there are several epochs.
+        A row for the whole frame and one for each of six stars, the first three and the brightest
+        of the others: image, model, residuals and extended source. With several images, each row
+        shows that whose residuals are largest there. Below them the errors that held-out counts
+        estimate, or else the objective; and light curves of the stars where there are several
+        epochs.
 
     Raises
     ------
@@ -171,7 +174,8 @@ def draw_result(view: ResultView) -> Figure:
     has_images = len(view.images) > 0
     shape = (len(regions), 4) if has_images else (-(-len(regions) // 4), min(len(regions), 4))
     height = 2.7 * shape[0]
-    below = [draw_choice, *([draw_light_curves] if view.light_curves else [])]
+    below: list[Any] = [(draw_choice, view), (light_curves.draw, view.light_curves)]
+    below = below[: 1 + (view.light_curves is not None)]
     heights = height, *(2.3 for _ in below)
     figure = new_figure(max(3.0 * shape[1], 6.0), sum(heights) + 0.6)
     parts: Any = figure.subfigures(len(heights), 1, height_ratios=heights)
@@ -190,9 +194,9 @@ def draw_result(view: ResultView) -> Figure:
     for axis in axes[:, 0]:
         axis.set_ylabel("y (pixels)", fontsize=9)
     if len(view.stars) > len(stars):
-        parts[0].suptitle(f"enlarged: the {len(stars)} brightest of {len(view.stars)} stars")
-    for part, draw in zip(parts[1:], below, strict=True):
-        draw(part.subplots(), view)
+        parts[0].suptitle(f"enlarged: {len(stars)} of {len(view.stars)} stars")
+    for part, (draw, what) in zip(parts[1:], below, strict=True):
+        draw(part.subplots(), what)
     return figure
 
 
@@ -209,8 +213,9 @@ def worst_image(view: ResultView, region: Region) -> int:
 def image_limits(image: NDArray[Any]) -> tuple[float, float, float]:
     """Return the darkest and the brightest level of an image, and the noise of its sky.
 
-    The noise is 1.4826 times the median deviation from the median; the darkest level is three times
-    that below the median, or the lowest pixel.
+    The noise is 1.4826 times the median deviation from the median, or a thousandth of the range
+    where that is as small as rounding, as in images of few counts. The darkest level is three
+    times that deviation below the median, or the lowest pixel.
     """
     good = image[np.isfinite(image)]
     if not good.size:
@@ -219,7 +224,7 @@ def image_limits(image: NDArray[Any]) -> tuple[float, float, float]:
     noise = 1.4826 * float(np.median(abs(good - middle)))
     low, high = max(middle - 3 * noise, float(good.min())), float(good.max())
     span = high - low or abs(high) or 1.0
-    return low, max(high, low + 1e-6 * span), noise or 1e-3 * span
+    return low, max(high, low + 1e-6 * span), noise if noise > 1e-6 * span else 1e-3 * span
 
 
 def brightest(extended: Array) -> float:
@@ -234,25 +239,17 @@ def _draw_images(axes: Sequence[Axes], view: ResultView, region: Region) -> None
 
     j = worst_image(view, region)
     there = region.slices(view.images[j].shape, view.offset_at(j, region))
-    _, _, noise = image_limits(view.images[j])
     low, high, _ = image_limits(view.images[j][there])
     name = "image" if len(view.images) == 1 else f"image {j + 1} of {len(view.images)}"
-    for axis, cube, title in zip(
-        axes,
-        (view.images, view.models, view.residuals),
-        (f"{name}, {region.name}", "model", "residuals / noise"),
-        strict=True,
-    ):
-        if cube is view.residuals:
-            norm, colours = Normalize(-MAX_SIGMA, MAX_SIGMA), "RdBu_r"
-        else:
-            norm, colours = AsinhNorm(noise, low, high), COLOUR_MAP
-        shown = _draw_region(axis, cube[j], there, norm, colours)
+    norm = AsinhNorm(image_limits(view.images[j])[2], low, high)
+    light = norm, COLOUR_MAP, f"{as_text(view.unit)} per pixel"
+    noise = Normalize(-MAX_SIGMA, MAX_SIGMA), "RdBu_r", "sigma"
+    cubes = (view.images, light), (view.models, light), (view.residuals, noise)
+    titles = f"{name}, {region.name}", "model", "residuals / noise"
+    for axis, (cube, (each, colours, label)), title in zip(axes, cubes, titles, strict=True):
+        _add_bar(axis, _draw_region(axis, cube[j], there, each, colours), label)
         axis.set_title(title, fontsize=10)
-        label = "sigma" if cube is view.residuals else "electron"
-        _add_bar(axis, shown, label)
-        if cube is view.images:
-            _mark_stars(axis, [view.place(j, star) for star in view.stars])
+    _mark_stars(axes[0], [view.place(j, star) for star in view.stars])
 
 
 def draw_extended(
@@ -269,7 +266,7 @@ def draw_extended(
         outline(axis, view.doubtful, there, view.oversample)
         title += f"\n{OUTLINED}"
     axis.set_title(title, fontsize=10)
-    _add_bar(axis, shown, as_text(view.unit))
+    _add_bar(axis, shown, f"{as_text(view.unit)} per pixel")
     _mark_stars(axis, view.stars)
 
 
@@ -340,17 +337,10 @@ def _mark_stars(axis: Axes, stars: Sequence[tuple[float, float]]) -> None:
         _, x, y = np.transpose(inside)
         for colour, width in (("black", 2.4), ("white", 1.1)):
             axis.plot(x, y, "o", ms=11, mfc="none", mec=colour, mew=width)
+    style = {"textcoords": "offset points", "fontsize": 8, **outlined("white", "black")}
     for s, left_of, below in inside if len(inside) <= MOST_NUMBERED else []:
-        axis.annotate(
-            f"{s}", (left_of, below), (6, 6), textcoords="offset points", color="white", fontsize=8
-        )
+        axis.annotate(f"{s}", (left_of, below), (6, 6), **style)
     axis.set(xlim=(left, right), ylim=(bottom, top))
-
-
-def draw_light_curves(axis: Axes, view: ResultView) -> None:
-    """Draw the light curves of a view that has some."""
-    if view.light_curves is not None:
-        light_curves.draw(axis, view.light_curves)
 
 
 def draw_choice(axis: Axes, view: ResultView) -> None:

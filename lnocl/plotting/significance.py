@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 from lnocl.core.scene.arrays import Array
 from lnocl.plotting.figure import (
@@ -18,9 +14,12 @@ from lnocl.plotting.figure import (
     MOST_NUMBERED,
     MOST_STARS,
     STYLES,
+    Axes,
+    Figure,
     as_text,
     extent_of,
     new_figure,
+    outlined,
     show_image,
 )
 
@@ -64,27 +63,25 @@ class SignificanceView:
 
 
 def draw_significance(view: SignificanceView) -> Figure:
-    """Draw the maps that there are, and the curves of limits, beside each other.
+    """Draw the maps that there are, and the curves of limits, two in a row.
 
     Raises
     ------
     LnoclError
         matplotlib is missing.
     """
-    panels: list[Callable[[Axes, SignificanceView], None]] = []
-    if view.signal is not None:
-        panels.append(_draw_signal)
-    if view.limit is not None:
-        panels.append(_draw_limit)
-    if view.curves is not None and any(
-        np.isfinite(values).any()
-        for name, values in view.curves.items()
-        if name.startswith("magnitudes")
-    ):
-        panels.append(_draw_curves)
-    figure = new_figure(6.2 * len(panels), 4.8)
-    for axis, draw in zip(figure.subplots(1, len(panels), squeeze=False)[0], panels, strict=True):
-        draw(axis, view)
+    curves = view.curves or {}
+    magnitudes = [curves[name] for name in curves if name.startswith("magnitudes")]
+    wanted = {
+        _draw_signal: view.signal is not None,
+        _draw_limit: view.limit is not None,
+        _draw_curves: np.isfinite(magnitudes).any(),
+    }
+    panels = [draw for draw, is_there in wanted.items() if is_there]
+    n_rows, n_columns = -(-len(panels) // 2), min(len(panels), 2)
+    figure = new_figure(6.2 * n_columns, 4.8 * n_rows)
+    for k, draw in enumerate(panels, 1):
+        draw(figure.add_subplot(n_rows, n_columns, k), view)
     return figure
 
 
@@ -104,12 +101,11 @@ def _draw_signal(axis: Axes, view: SignificanceView) -> None:
         for chosen, marker in ((is_point, "o"), (~is_point, "s")):
             axis.plot(x[chosen], y[chosen], marker, ms=11, mfc="none", mec="k", mew=1.2)
         for i in range(min(n, MOST_NUMBERED)):
-            axis.annotate(f"{i + 1}", (x[i], y[i]), (6, 6), textcoords="offset points", fontsize=8)
+            style = {"textcoords": "offset points", "fontsize": 8, **outlined("black", "white")}
+            axis.annotate(f"{i + 1}", (x[i], y[i]), (6, 6), **style)
     what = "points" if not view.width else f"sources {view.width:g} pixels wide"
-    axis.set_title(
-        f"{what}: {n} above {view.threshold:.2f}\ncircles: points; squares: perhaps extended",
-        fontsize=9,
-    )
+    title = f"{what}: {n} above {view.threshold:.2f}\ncircles: points; squares: perhaps extended"
+    axis.set_title(title, fontsize=9)
 
 
 def _draw_limit(axis: Axes, view: SignificanceView) -> None:

@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
 from lnocl.core.scene.arrays import Array
-from lnocl.plotting.figure import COLOURS, new_figure, show_image
+from lnocl.plotting.figure import COLOURS, Figure, new_figure, outlined, show_image
 from lnocl.plotting.result import image_limits
 
 # Stars that are numbered, the brightest; more would hide each other.
@@ -54,7 +51,7 @@ def draw_stars(image: Array, stars: Mapping[str, Any]) -> Figure:
     for i in np.argsort(-np.asarray(stars["peak"], float))[:MAX_NUMBERED]:
         axis.annotate(
             f"{stars['star'][i]}", (x[i], y[i]), (4, 4), textcoords="offset points",
-            fontsize=7, annotation_clip=True, color=COLOURS[0] if saturated[i] else COLOURS[1],
+            fontsize=7, annotation_clip=True, **outlined(COLOURS[1 - saturated[i]], "white"),
         )  # fmt: skip
     axis.set(xlim=(-0.5, nx - 0.5), ylim=(-0.5, ny - 0.5), xlabel="x (pixels)", ylabel="y (pixels)")
     more = f", the brightest {MAX_NUMBERED} numbered" if len(x) > MAX_NUMBERED else ""

@@ -299,8 +299,8 @@ class Result(Measured):
         images. The primary HDU holds the extended source. The tables STARS, HALOS, HISTORY,
         HELDOUT and PLAN hold the stars, the amounts of halos, the objectives, the errors that
         held-out counts estimate, and the plan. The cubes MODELS and RESIDUALS hold those of each
-        image. PSFS and others are added where PSFs were refined. Units are electrons, per second
-        where exposures were given.
+        image, ELECTRONS how many electrons of it are in the unit of the file. PSFS and others are
+        added where PSFs were refined. Units are electrons, per second where exposures were given.
 
         Parameters
         ----------

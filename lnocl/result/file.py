@@ -16,6 +16,7 @@ from lnocl.io.fitsread import wcs_cards
 from lnocl.io.fitswrite import Card, column_unit, write_result
 from lnocl.io.parts import PARTS, Column
 from lnocl.result.kept import to_parts
+from lnocl.result.views import electrons_in
 
 if TYPE_CHECKING:
     from astropy.io import fits
@@ -97,6 +98,7 @@ def write_file(
     if has_cubes:
         models = result.models()
         parts |= {"MODELS": models, "RESIDUALS": result._residuals(models)}
+        parts["ELECTRONS"] = electrons_in(result, electrons)
     if refinement is not None:
         parts |= _psf_parts(result, refinement)
     steps = zip(*(line.split(": ", 1) for line in result.plan.splitlines()), strict=True)
@@ -160,7 +162,8 @@ def _halos(result: Result) -> list[Column]:
     """Return the amounts of halos, a row for each halo and image, both counted from 1."""
     numbers = np.indices(result.halo_fluxes.shape) + 1
     columns = [*numbers, result.halo_fluxes, result.halo_flux_errors]
-    return [*map(Column, PARTS["HALOS"].columns, map(np.ravel, columns))]
+    units = "", "", *[column_unit("electron")] * 2
+    return [*map(Column, PARTS["HALOS"].columns, map(np.ravel, columns), units)]
 
 
 def _star_columns(

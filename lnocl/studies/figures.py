@@ -1,4 +1,4 @@
-"""Pictures and reports of results, from their files."""
+"""Pictures of results, from their files."""
 
 from __future__ import annotations
 
@@ -11,16 +11,13 @@ import numpy as np
 from lnocl.core.runs.outcome import mean_over_epochs
 from lnocl.errors import InputError
 from lnocl.io import atomic
-from lnocl.io.headers import number
 from lnocl.io.parts import read_parts
 from lnocl.io.saved_results import SavedResult, read_result
 from lnocl.plotting.beside import draw_beside
 from lnocl.plotting.figure import check_matplotlib, save_figure
 from lnocl.plotting.light_curves import light_curves
 from lnocl.plotting.profiles import draw_bands
-from lnocl.plotting.report import make_report
 from lnocl.plotting.result import ResultView, draw_result
-from lnocl.plotting.significance import SignificanceView
 
 if TYPE_CHECKING:
     from astropy.table import Table
@@ -70,7 +67,7 @@ def draw(folder: str, results: Sequence[str], overwrite: bool = False) -> Iterat
     outputs = [f"{name}.png" for name in (*pictures, *profiles, "objects")]
     atomic.check_folder(folder, overwrite, outputs, make=False)
     saved = [read_result(path) for path in results]
-    _check_saved(saved)
+    check_saved(saved)
     views = [view_of(each) for each in saved]
     atomic.check_folder(folder, overwrite, outputs)
     for picture, each, view in zip(pictures, saved, views, strict=True):
@@ -104,53 +101,6 @@ def read_profiles(path: str) -> list[tuple[str, Table, Table, str]]:
     return found
 
 
-def report(path: str) -> str:
-    """Return a page of HTML that shows a saved result.
-
-    Raises
-    ------
-    LnoclError
-        matplotlib is missing.
-    FileError
-        The file cannot be read, or is not a result.
-    InputError
-        It holds values that are not finite, or a star outside its image.
-    """
-    check_matplotlib()
-    saved = read_result(path)
-    _check_saved([saved])
-    target = str(saved.header.get("OBJECT") or saved.header.get("TARGNAME") or "").strip()
-    title = os.path.basename(path) + (f": {target}" if target else "")
-    cards = [
-        (card.keyword, card.value, card.comment)
-        for card in saved.header.cards
-        if card.keyword not in ("", "COMMENT", "HISTORY", "SIMPLE", "BITPIX", "EXTEND")
-    ]
-    stars = {name: column.tolist() for name, column in saved.tables["STARS"].items()}
-    found = _found(path, saved)
-    return make_report(view_of(saved), title, saved.messages, stars, cards, saved.commands(), found)
-
-
-def _found(path: str, saved: SavedResult) -> SignificanceView | None:
-    """Return the detections and limits of a saved result; None where it has none."""
-    parts = read_parts(path, ("DETECTIONS", "LIMITS", "SIGNAL", "LIMIT50"))
-    found = {name: part.values for name, part in parts.items()}
-    table = parts.get("LIMITS", parts.get("DETECTIONS"))
-    if table is None:
-        return None
-    return SignificanceView(
-        list(dict.fromkeys(saved.stars)),  # of a star in several epochs one
-        saved.oversample,
-        number(path, table.header, "THRESHOL") or np.nan,
-        number(path, table.header, "SRCWIDTH") or 0.0,
-        str(table.header.get("FLUXUNIT", "")),
-        found.get("SIGNAL"),
-        found.get("DETECTIONS"),
-        found.get("LIMIT50"),
-        found.get("LIMITS"),
-    )
-
-
 def view_of(saved: SavedResult) -> ResultView:
     """Return the arrays and texts of the picture of a saved result."""
     q = saved.oversample
@@ -159,28 +109,20 @@ def view_of(saved: SavedResult) -> ResultView:
         np.where(abs(cube) < LARGEST, cube, np.nan)
         for cube in (saved.cubes.get(name, nothing) for name in ("MODELS", "RESIDUALS"))
     )
-    # Electrons, as images and models are, whatever the unit of the file.
-    alone = f"1 {saved.header.get('BUNIT', '')}"
-    table = saved.tables["STARS"]
+    electrons = saved.cubes.get("ELECTRONS", np.ones(1))
+    images = models + residuals * np.sqrt(models.clip(0.0))
+    table, unit = saved.tables["STARS"], str(saved.header.get("BUNIT", "unknown unit"))
     epochs = table.get("epoch", np.zeros(len(saved.stars), int))
     n_epochs = int(np.max(epochs, initial=0)) + 1
-    factor, _, unit = str(saved.header.get("ONEUNIT", alone)).partition(" ")
-    try:
-        electrons = float(factor)
-    except ValueError:
-        raise InputError(
-            f"ONEUNIT of {saved.path} is {factor!r}, not a number and its unit: delete the card, "
-            "or deconvolve again"
-        ) from None
     return ResultView(
-        extended=electrons * saved.extended,
+        extended=saved.extended,
         stars=saved.stars[::n_epochs],  # once each, whatever epochs there are
         star_fluxes=mean_over_epochs(saved.star_fluxes, n_epochs),
         n_iter=int(saved.number("NITER") or 0),
         history=saved.tables.get("HISTORY", {}),
         held_out=saved.tables.get("HELDOUT", {}),
-        images=models + residuals * np.sqrt(models.clip(0.0)),
-        models=models,
+        images=images / electrons,
+        models=models / electrons,
         residuals=residuals,
         offsets=saved.offsets,
         turns=saved.turns,
@@ -191,7 +133,7 @@ def view_of(saved: SavedResult) -> ResultView:
             saved.star_fluxes,
             table.get("variation_error", np.full(len(epochs), np.nan)),
             saved.epoch_labels,
-            str(saved.header.get("BUNIT", "")),
+            unit,
         ),
     )
 
@@ -203,7 +145,14 @@ def save(folder: str, name: str, figure: Figure, overwrite: bool) -> str:
     return f"drew {path}"
 
 
-def _check_saved(saved: Sequence[SavedResult]) -> None:
+def check_saved(saved: Sequence[SavedResult]) -> None:
+    """Refuse results that cannot be drawn, or not beside each other.
+
+    Raises
+    ------
+    InputError
+        Their shapes differ, one holds values that are not finite, or has a star outside its image.
+    """
     first = saved[0]
     ny, nx = first.extended.shape
     for each in saved:

@@ -100,6 +100,7 @@ class TestFrames:
             "HISTORY",
             "MODELS",
             "RESIDUALS",
+            "ELECTRONS",
             "PLAN",
             "MESSAGES",
             "ESTIMATE",
@@ -172,9 +173,13 @@ class TestFrames:
             assert hdus["MODELS"].header["BUNIT"] == "electron"
             assert "BUNIT" not in hdus["RESIDUALS"].header
         assert header["BUNIT"] == "adu/s"
-        picture = view_of(read_result("out.fits"))  # all of it is in electrons
-        assert picture.unit == "electron/s"
-        np.testing.assert_allclose(picture.extended, 1.7 * fits.getdata("out.fits"))
+        picture = view_of(read_result("out.fits"))  # all of it is in the unit of the tables
+        assert picture.unit == "adu/s"
+        np.testing.assert_array_equal(picture.extended, fits.getdata("out.fits"))
+        electrons = 1.7 * np.reshape([30.0, 60.0], (2, 1, 1))
+        np.testing.assert_allclose(fits.getdata("out.fits", "ELECTRONS"), electrons, rtol=1e-6)
+        given = fits.getdata("out.fits", "MODELS") / electrons
+        np.testing.assert_allclose(picture.models, given, rtol=1e-6)
         numbers = range(1, table["TFIELDS"] + 1)
         named = {table[f"TTYPE{i}"]: table.get(f"TUNIT{i}", "") for i in numbers}
         assert named == {

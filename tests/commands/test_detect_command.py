@@ -1,6 +1,7 @@
 """``lnocl detect`` and ``lnocl limit``: what they write, say and refuse."""
 
 import os
+import re
 from pathlib import Path
 
 import numpy as np
@@ -137,16 +138,23 @@ def test_pictures_and_the_report_show_them(capsys):
         assert Path(name).read_bytes().startswith(b"\x89PNG")
     assert cli.main(["report", "out.fits", "-o", "page.html"]) == 0
     page = Path("page.html").read_text()
-    assert "<h2>Detections and limits</h2>" in page
-    assert "<th>detection</th><th>x</th>" in page
+    assert "<h2>Detections</h2>" in page
+    assert "<th>detection</th><th>x (pix)</th>" in page
+    assert "<th>flux (electron)</th>" in page
     assert "<td>point</td>" in page
-    assert "Limits round each star" in page
+    assert "<h2>Limits</h2>" in page
+    assert "<th>magnitudes 50 % (mag)</th>" in page
 
 
 def test_a_report_without_them_has_no_section():
     pytest.importorskip("matplotlib")
     assert cli.main(["report", "out.fits", "-o", "page.html"]) == 0
-    assert "Detections and limits" not in Path("page.html").read_text()
+    page = Path("page.html").read_text()
+    assert re.findall("<h2>(.*?)</h2>", page)[2:] == [
+        "Stars",
+        "How the iteration was chosen",
+        "How to make it again",
+    ]
 
 
 @pytest.mark.exhaustive

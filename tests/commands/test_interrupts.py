@@ -40,7 +40,8 @@ def interrupted(small_command, monkeypatch):
 
 def assert_whole(path):
     with fits.open(path, checksum=True) as hdus:
-        names = ["STARS", "HISTORY", "MODELS", "RESIDUALS", "PLAN", "MESSAGES", "ESTIMATE"]
+        names = ["STARS", "HISTORY", "MODELS", "RESIDUALS", "ELECTRONS", "PLAN", "MESSAGES"]
+        names += ["ESTIMATE"]
         assert [hdu.name for hdu in hdus[1:]] == names
         assert (hdus[0].header["STOPPED"], hdus[0].header["NITER"]) == ("n_iter", 3)
 

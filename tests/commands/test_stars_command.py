@@ -61,6 +61,8 @@ def test_the_picture_has_the_stars_and_their_numbers(capsys):
     places = [line.get_data()[0].tolist() for line in axis.lines]
     assert places == [[stars["x"][0]], [stars["x"][1]]]
     assert [text.get_text() for text in axis.texts] == ["1", "2"]
+    edges = [effect._gc["foreground"] for text in axis.texts for effect in text.get_path_effects()]
+    assert edges == ["white", "white"]  # round dark letters, on dark stars
     assert axis.get_title() == "2 stars; orange: saturated"
 
 

@@ -18,6 +18,7 @@ from lnocl.io import fitswrite
 from lnocl.io.parts import Column
 from lnocl.plotting import report
 from lnocl.plotting.report import make_report
+from lnocl.studies import reports
 
 pytest.importorskip("matplotlib")
 
@@ -27,11 +28,16 @@ def data_of(page):
     return json.loads(text)
 
 
-def decoded(layer):
-    """Return the values of a picture as the page's own script reads them; bad pixels are NaN."""
+def codes_of(layer):
+    """Return the codes of a picture, the first row below."""
     from PIL import Image
 
-    codes = np.array(Image.open(io.BytesIO(base64.b64decode(layer["png"]))))[::-1].astype(float)
+    return np.array(Image.open(io.BytesIO(base64.b64decode(layer["png"]))))[::-1]
+
+
+def decoded(layer):
+    """Return the values of a picture as the page's own script reads them; bad pixels are NaN."""
+    codes = codes_of(layer).astype(float)
     step = (codes - 1) / 254
     low, high, scale = layer["low"], layer["high"], layer["scale"]
     if scale:
@@ -73,6 +79,33 @@ def test_the_offset_of_an_image_moves_its_corner():
     assert (zoom["source"]["x"], zoom["source"]["y"]) == (16, 6)
 
 
+@pytest.mark.parametrize("oversample", [1, 2])
+def test_what_errors_of_the_psf_may_fake_is_outlined(oversample):
+    doubtful = np.zeros((60 * oversample, 70 * oversample), bool)
+    doubtful[20 * oversample : 30 * oversample, 5 * oversample : 9 * oversample] = True
+    view = make_view(p=0, doubtful=doubtful, extended=1.0 * doubtful, oversample=oversample)
+    for region in data_of(make_report(view, "a"))["regions"]:
+        light = decoded(region["source"])
+        np.testing.assert_array_equal(codes_of(region["source"]["doubtful"]) == 1, light > 0)
+        assert light.any()
+    assert "doubtful" not in data_of(make_report(make_view(p=0), "a"))["regions"][0]["source"]
+
+
+def test_stars_of_a_turned_image_are_where_it_sees_them():
+    turn = np.array([[0.0, -1.0], [1.0, 0.0]])
+    view = make_view(p=2, stars=[(40.0, 30.0), (45.0, 33.0)], star_fluxes=np.ones(2),
+                     turns=np.array([np.eye(2), turn]),
+                     offsets=np.array([[0.0, 0.0], [73.0, -12.0]]))  # fmt: skip
+    region = data_of(make_report(view, "a"))["regions"][1]
+    layer, turned = region["images"][1][0], np.array(region["turned"][1])
+    places = [turned @ (*star, 1.0) for star in view.stars]
+    corner = layer["x"], layer["y"]
+    np.testing.assert_allclose(places[0], view.stars[0])
+    first = np.array(view.place(1, view.stars[0])) - (24.0, 24.0)  # the region begins there
+    for star, place in zip(view.stars, places, strict=True):
+        np.testing.assert_allclose(place - corner, view.place(1, star) - first)
+
+
 def test_an_image_that_does_not_see_a_star_has_no_picture_of_it():
     view = make_view(p=2, offsets=np.array([[0.0, 0.0], [-400.0, 0.0]]))
     images = data_of(make_report(view, "a"))["regions"][1]["images"]
@@ -108,7 +141,7 @@ def test_it_needs_no_other_file_and_evaluates_nothing_of_the_result():
         dataclasses.replace(make_view(p=1), unit=wicked),
         wicked,
         [wicked, "", f"warning: {wicked}", wicked],
-        {wicked: [1.0]},
+        {"Stars": {wicked: [wicked]}},
         [("OBJECT", wicked, wicked)],
         wicked,
     )
@@ -136,7 +169,13 @@ class TestCommand:
             np.ones((32, 32)),
             [(3, 4)],
             [7.5],
-            {"MODELS": cube, "RESIDUALS": cube, "MESSAGES": messages(*said)},
+            {
+                "MODELS": cube * np.arange(1, 33),
+                "RESIDUALS": cube,
+                "ELECTRONS": 2 * cube[:, :1, :1],
+                "MESSAGES": messages(*said),
+            },
+            unit="adu",
             cards=[("OBJECT", "RW Aur", "")],
             commands=[["cd", "/home/me/" + "data" * 30], ["lnocl", "deconvolve", "b.fits"]],
         )
@@ -148,11 +187,16 @@ class TestCommand:
         for part in ("<title>a.fits: RW Aur</title>", "lnocl deconvolve b.fits", "the model fits",
                      "<pre>the model fits</pre>",
                      "<ul class='warning'><li>warning: it is noisy", "<li>gain 2</li>",
-                     "<td>7.5</td>"):  # fmt: skip
+                     "<th>flux (adu)</th>", "<td>7.5</td>"):  # fmt: skip
             assert part in page
         assert "/home/me" not in page
         assert "datadata" not in page
-        assert len(data_of(page)["regions"]) == 2
+        whole, _ = data_of(page)["regions"]
+        layers = [*whole["images"][0], whole["source"]]
+        assert [layer["unit"] for layer in layers] == ["adu", "adu", "sigma", "adu"]
+        # 2 electrons are an adu; an image is its model and a residual of one standard deviation.
+        image, model, *_ = map(decoded, layers)
+        assert (image[0, -1], model[0, -1]) == pytest.approx(((32 + 32**0.5) / 2, 16), rel=0.02)
 
     def test_a_star_that_was_moved_over_the_edge_is_shown(self):
         cube = np.ones((1, 32, 32))
@@ -172,6 +216,73 @@ class TestCommand:
         page = Path("b.html").read_text()
         assert "The file has no models and residuals: repeat the run with both." in page
         assert data_of(page)["regions"][0]["images"] == []
+
+    def test_whether_to_trust_it_comes_first_and_is_said_once(self):
+        fault = "the model does not fit at 1 of 1 star, (3, 4): give a better PSF"
+        said = ["star 1  7.5 adu", f"trust   no: {fault}", "        a source is not named"]
+        said += ["9 steps", "", f"warning: {fault}", "warning: it is noisy"]
+        fitswrite.write_result("b.fits", np.ones((8, 8)), [], [], {"MESSAGES": messages(*said)})
+        page = reports.report("b.fits")
+        assert f"<ul class='trust'><li>no: {fault}</li><li>a source is not named</li></ul>" in page
+        assert "<pre>star 1  7.5 adu\n9 steps</pre>" in page
+        assert "<ul class='warning'><li>warning: it is noisy</li></ul>" in page
+
+    def test_values_have_their_errors_and_units_or_say_that_they_have_none(self):
+        columns = [Column("flux_error", [310.0, np.nan, 25.0, 25.0], "adu"),
+                   Column("epoch", [0.0, 1.0, 0.0, 1.0]),
+                   Column("ra", np.full(4, 65.4891), "deg")]  # fmt: skip
+        parts = {"EPOCHS": [Column("label", ["May", "June"])]}
+        places, fluxes = [(3, 4), (3, 4), (9.256, 9), (9.256, 9)], [181726.0, 18e4, 2500.0, np.nan]
+        fitswrite.write_result(
+            "b.fits", np.ones((16, 16)), places, fluxes, parts, star_columns=columns, unit="adu"
+        )
+        page = reports.report("b.fits")
+        head = "star", "x (pix)", "y (pix)", "flux (adu)", "epoch", "ra (deg)"
+        assert "".join(f"<th>{name}</th>" for name in head) in page
+        rows = [
+            ("1", "3.00", "4.00", "181 730 ± 310", "May", "65.489100"),
+            ("1", "3.00", "4.00", "180000, error unknown", "June", "65.489100"),
+            ("2", "9.26", "9.00", "2 500 ± 25", "May", "65.489100"),
+            ("2", "9.26", "9.00", "unknown, error unknown", "June", "65.489100"),
+        ]
+        for row in rows:
+            assert "".join(f"<td>{cell}</td>" for cell in row) in page
+
+    def test_what_was_measured_is_shown_and_nothing_else(self):
+        regions = [Column("name", ["ring"]), Column("x", [4.0], "pix"), Column("flux", [50.0])]
+        regions += [Column("error", [3.0]), Column("unit", ["adu"]), Column("note", [""])]
+        errors = [Column("name", ["star 1 flux", "jet flux"]), Column("at", [np.nan, 3.0]),
+                  Column("unit", ["adu", "adu"]), Column("note", ["", ""]),
+                  Column("value", [9.0, 1.0]), Column("bias", [1.0, 0.0]),
+                  Column("error", [2.0, 0.5])]  # fmt: skip
+        parts = {"REGIONS": regions, "ERRORS": errors}
+        fitswrite.write_result("b.fits", np.ones((16, 16)), [], [], parts, unit="adu")
+        page = reports.report("b.fits")
+        titles = ["Can it be trusted?", "Pictures", "Regions", "Errors", "How to make it again"]
+        assert re.findall("<h2>(.*?)</h2>", page) == titles
+        assert "<td>ring</td><td>4.00</td><td>50.0 ± 3.0</td><td>adu</td></tr>" in page
+        assert "<td>star 1 flux</td><td>8.0 ± 2.0</td><td>adu</td></tr>" in page
+        assert "jet flux" not in page  # a slice of a profile, which is drawn
+        names = "x", "y", "flux", "kind"
+        empty = {"REGIONS": [Column("name", np.array([], "U4"))],
+                 "DETECTIONS": [Column(name, np.zeros(0)) for name in names]}  # fmt: skip
+        fitswrite.write_result("none.fits", np.ones((16, 16)), [], [], empty)
+        page = reports.report("none.fits")
+        assert re.findall("<h2>(.*?)</h2>", page)[2:] == ["Detections", "How to make it again"]
+        assert "<h2>Detections</h2><p>None.</p>" in page  # they were looked for
+
+    @pytest.mark.parametrize("oversample", [1, 2])
+    def test_axes_of_images_with_coordinates_are_in_arcsec(self, oversample):
+        turn = np.array([[-np.cos(0.3), np.sin(0.3)], [np.sin(0.3), np.cos(0.3)]])
+        wcs = fits.Header({"CTYPE1": "RA---TAN", "CTYPE2": "DEC--TAN", "CRVAL1": 359.9999,
+                           "CRVAL2": 60.0, "CRPIX1": 9.0, "CRPIX2": 9.0,
+                           "CDELT1": 2.5e-4, "CDELT2": 2.5e-4})  # fmt: skip
+        wcs.update({f"PC{i + 1}_{k + 1}": value for (i, k), value in np.ndenumerate(turn)})
+        sky = np.ones((16 * oversample, 16 * oversample))
+        fitswrite.write_result("b.fits", sky, [(3, 4)], [7.5], wcs=wcs, oversample=oversample)
+        found = data_of(reports.report("b.fits"))["arcseconds"]
+        np.testing.assert_allclose(found, 0.9 * turn, atol=2e-4)
+        assert data_of(reports.report("a.fits"))["arcseconds"] is None
 
     @pytest.mark.parametrize(
         ("arguments", "status", "message"),

@@ -115,14 +115,36 @@ def test_a_flat_image_and_an_empty_source_are_drawn(value, tmp_path):
 
 
 @pytest.mark.exhaustive
-def test_of_many_stars_the_brightest_are_enlarged():
+def test_of_many_stars_the_first_and_the_brightest_are_enlarged():
     view = make_view(p=1, n_stars=9)
     view.star_fluxes[8] = 100.0
+    view.star_fluxes[:3] = 0.0, np.nan, 0.5  # those named before a table, however faint
     figure = draw_result(view)
     titles = [title for title, _ in panels(figure) if title.startswith("image")]
     assert titles[1:] == [f"image, star {s}" for s in (1, 2, 3, 4, 5, 9)]
     assert len(titles) == 1 + MOST_STARS
-    assert "6 brightest of 9 stars" in figure.subfigs[0].get_suptitle()
+    assert "enlarged: 6 of 9 stars" in figure.subfigs[0].get_suptitle()
+
+
+def test_rounding_is_not_taken_for_noise():
+    few = np.zeros((32, 32))
+    few[::7, ::5] = 20.0
+    rounded = few + 1e-7 * np.random.default_rng(1).normal(size=few.shape)
+    assert image_limits(few)[2] == pytest.approx(0.02)
+    assert image_limits(rounded)[2] == pytest.approx(0.02)
+    assert image_limits(rounded * 0.0 + np.arange(32.0))[2] == pytest.approx(1.4826 * 8.0)
+
+
+def test_pictures_have_the_unit_of_the_tables():
+    axes = draw_result(make_view(p=1, unit="adu")).subfigs[0].axes
+    labels = [axis.child_axes[0].get_ylabel() for axis in axes[:4]]
+    assert labels == ["adu per pixel", "adu per pixel", "sigma", "adu per pixel"]
+
+
+def test_numbers_of_stars_are_read_on_any_colour():
+    (number,) = draw_result(make_view(p=1)).subfigs[0].axes[0].texts
+    (edge,) = number.get_path_effects()
+    assert (number.get_color(), edge._gc["foreground"]) == ("white", "black")
 
 
 @pytest.mark.parametrize(

@@ -316,7 +316,6 @@ def test_errors_of_ours_are_not_taken_for_the_file_s(sound, monkeypatch):
     [
         ({"NITER": "many"}, "NITER of {} is 'many', not a finite number"),
         ({"OF": "truth", "NITER": "many"}, "NITER of {} is 'many', not a finite number"),
-        ({"ONEUNIT": "x y"}, "ONEUNIT of {} is 'x', not a number and its unit: delete the card"),
     ],
 )
 def test_what_should_be_numbers_in_a_header(sound, tmp_path, quick_figures, changes, message):

@@ -269,7 +269,7 @@ class TestPlot:
 
     @pytest.mark.exhaustive
     def test_several_results_of_several_stars_are_compared(self, capsys):
-        cubes = {name: np.ones((1, 32, 32)) for name in ("MODELS", "RESIDUALS")}
+        cubes = {name: np.ones((1, 32, 32)) for name in ("MODELS", "RESIDUALS", "ELECTRONS")}
         for name in "ab":
             fitswrite.write_result(
                 f"{name}.fits", np.ones((32, 32)), [(3, 4), (9, 9)], [2.0, 1.0], cubes

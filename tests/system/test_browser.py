@@ -1,5 +1,6 @@
 """The page of a result in a real browser, without a network: pictures, blink, stretch, keys."""
 
+import dataclasses
 import re
 from pathlib import Path
 
@@ -10,6 +11,14 @@ from result_views import make_view
 
 from lnocl.plotting.report import make_report
 
+LAYERS = ["image", "model", "residuals", "extended source"]
+# As wide as that of stars in several epochs.
+TABLE = {
+    "star": ["1"], "x (pix)": ["1024.25 ± 0.01"], "y (pix)": ["1024.25 ± 0.01"],
+    "flux (electron)": ["181 730 ± 310"], "epoch": ["2024-03-01T02:00:00"],
+    "variation error (electron)": ["1672"], "ra (deg)": ["165.489087"], "dec (deg)": ["-19.535168"],
+    "core rms": ["0.9767"], "wings rms": ["1.017"], "halo": ["8.716e-05"],
+}  # fmt: skip
 PAGES = sorted((Path(__file__).parents[2] / "docs" / "start" / "look").glob("*.html"))
 
 pytestmark = pytest.mark.system
@@ -18,35 +27,40 @@ pytest.importorskip("matplotlib")
 
 @pytest.fixture
 def page(browser, tmp_path):
-    """Open the page of a view with two images and a star; return the browser."""
-    view = make_view(p=2)
+    """Open the page of a view with two images and two stars; return the browser."""
+    view = make_view(p=2, n_stars=2)
     y, x = np.indices(view.extended.shape)
     bright = 4000.0 * np.exp(-((x - 10) ** 2 + (y - 20) ** 2) / 8.0)
     view.models[:] += bright
     view.images[:] = view.models + np.sqrt(view.models) * view.residuals
+    doubtful = np.zeros(view.extended.shape, bool)
+    doubtful[30:40, 30:40] = True
+    view = dataclasses.replace(view, doubtful=doubtful)
     path = tmp_path / "report.html"
-    path.write_text(make_report(view, "a jet", ["the model fits"]))
+    path.write_text(make_report(view, "a jet", ["the model fits"], {"Stars": TABLE}))
     browser.get(path.as_uri())
     wait_for(browser, lambda: layer(browser) == "image")
     return browser
 
 
 def layer(browser):
-    return browser.execute_script("return document.getElementById('canvas').dataset.layer")
+    return browser.execute_script("return document.querySelector('canvas')?.dataset.layer")
 
 
-def picture(browser):
-    return browser.execute_script("return document.getElementById('canvas').toDataURL()")
+def picture(browser, row=0):
+    script = "return document.querySelectorAll('.panels')[arguments[0]].firstChild.toDataURL()"
+    return browser.execute_script(script, row)
 
 
 def colour(browser, x, y):
-    """Return the colour at a pixel of the frame of 70 by 60, shown 640 wide."""
+    """Return the colour at a pixel of the whole frame, in the first picture."""
     script = (
-        "return Array.from(document.getElementById('canvas').getContext('2d')"
-        ".getImageData(arguments[0], arguments[1], 1, 1).data.slice(0, 3))"
+        "const canvas = document.querySelector('canvas'), f = canvas.frame;"
+        "const left = f.left + (arguments[0] + 0.5) * f.scale;"
+        "const top = f.top + f.height - (arguments[1] + 0.5) * f.scale;"
+        "return Array.from(canvas.getContext('2d').getImageData(left, top, 1, 1).data.slice(0, 3))"
     )
-    scale = 640 / 70
-    return browser.execute_script(script, int((x + 0.5) * scale), int((60 - y - 0.5) * scale))
+    return browser.execute_script(script, x, y)
 
 
 def choose(browser, name, text):
@@ -74,15 +88,63 @@ def test_the_pages_in_docs_are_shown(path, browser):
     assert browser.get_log("browser") == []
 
 
-def test_each_button_shows_its_picture(page):
-    shown = {}
-    for button in page.find_elements("css selector", "#layers button"):
+def test_each_button_shows_its_picture_and_the_first_shows_all(page):
+    shown, row = (
+        {},
+        "return [...document.querySelector('.panels').children].map(c => c.dataset.layer)",
+    )
+    everything, *buttons = page.find_elements("css selector", "#layers button")
+    for button in buttons:
         button.click()
-        wait_for(page, lambda name=button.text: layer(page) == name)
+        wait_for(page, lambda name=button.text: page.execute_script(row) == [name])
         shown[button.text] = picture(page)
         assert button.get_attribute("aria-pressed") == "true"
-    assert list(shown) == ["image", "model", "residuals", "extended source"]
+    assert list(shown) == LAYERS
     assert len(set(shown.values())) == 4
+    everything.click()
+    wait_for(page, lambda: page.execute_script(row) == LAYERS)
+
+
+def test_what_errors_of_the_psf_may_fake_is_outlined_in_red(page):
+    page.find_elements("css selector", "#layers button")[4].click()
+    wait_for(page, lambda: layer(page) == "extended source")
+    red, green, blue = colour(page, 30 - 0.45, 35)
+    assert red > 2 * max(green, blue)
+    red, green, blue = colour(page, 35, 35)
+    assert red < 2 * max(green, blue)
+
+
+def test_axes_and_colour_bars_have_round_numbers(page):
+    steps = page.execute_script("return steps(-0.5, 69.5, 200, 45)")
+    assert steps == [0, 20, 40, 60]
+    script = "return levels(document.querySelectorAll('canvas')[arguments[0]].frame.layer, 200)"
+    image, residuals = (page.execute_script(script, k) for k in (0, 2))
+    assert {50, 100, 1000} <= set(image)
+    assert sorted(residuals) == [-4, -2, 0, 2, 4]
+    bar = (
+        "const canvas = document.querySelector('canvas'), f = canvas.frame;"
+        "const y = f.top + (arguments[0] ? 1 : f.height - 2), x = f.left + f.width + 12;"
+        "return Array.from(canvas.getContext('2d').getImageData(x, y, 1, 1).data.slice(0, 3))"
+    )
+    dark, bright = (page.execute_script(bar, end) for end in (0, 1))
+    assert max(dark) < 90
+    assert min(bright[:2]) > 220  # viridis, from violet to yellow
+
+
+@pytest.mark.parametrize("width", [1300, 400])
+def test_tables_are_whole_or_in_a_box_and_the_page_is_as_wide_as_the_screen(page, width):
+    size = {"width": width, "height": 900, "deviceScaleFactor": 1, "mobile": False}
+    page.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
+    try:
+        widths = (
+            "const box = document.querySelector('.box:has(th)'), all = document.documentElement;"
+            "return [all.scrollWidth, all.clientWidth, box.scrollWidth, box.clientWidth]"
+        )
+        content, screen, table, box = page.execute_script(widths)
+    finally:
+        page.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
+    assert content <= screen
+    assert (table <= box) == (width == 1300)
 
 
 def test_the_star_is_where_it_should_be(page):
@@ -94,7 +156,7 @@ def test_the_star_is_where_it_should_be(page):
 
 def test_the_stretch_changes_the_picture_as_it_should(page):
     brightness = []
-    script = "return document.getElementById('canvas').dataset.stretch"
+    script = "return document.querySelector('canvas').dataset.stretch"
     for name in ("linear", "square root", "asinh", "logarithm"):
         choose(page, "stretch", name)
         wait_for(page, lambda name=name: page.execute_script(script) == name)
@@ -115,7 +177,7 @@ def test_it_blinks_by_button_and_by_key(page):
 
     page.find_element("id", "blink").click()
     wait_for(page, look)
-    assert seen == ["image", "model", "residuals", "extended source"]
+    assert seen == LAYERS
     body = page.find_element("tag name", "body")
     page.execute_script("document.activeElement.blur()")
     body.send_keys(Keys.SPACE)
@@ -130,20 +192,26 @@ def test_regions_and_images_are_chosen(page):
     first = page.execute_script("return document.getElementById('image').selectedOptions[0].text")
     choose(page, "image", other[first])
     wait_for(page, lambda: picture(page) != before)
-    before = picture(page)
-    choose(page, "region", "star 1")
-    wait_for(page, lambda: picture(page) != before)
+    before = picture(page, row=1)
+    choose(page, "region", "star 2")
+    wait_for(page, lambda: picture(page, row=1) != before)
 
 
 def test_the_value_under_the_pointer_is_said(page):
     from selenium.webdriver import ActionChains
 
     page.find_element("id", "marks").click()
-    canvas = page.find_element("id", "canvas")
-    scale = canvas.size["width"] / 70
-    right, down = (10 - 34.5) * scale, (29.5 - 20) * scale  # from the middle
-    ActionChains(page).move_to_element_with_offset(canvas, int(right), int(down)).perform()
+    canvas = page.find_element("css selector", "canvas")
+    frame = page.execute_script(
+        "const f = arguments[0].frame; return [f.left, f.top, f.scale]", canvas
+    )
+    left, top, scale = frame
+    right, down = left + 10.5 * scale, top + (60 - 20.5) * scale
+    width, height = canvas.size["width"], canvas.size["height"]
+    to = int(right - width / 2), int(down - height / 2)  # from the middle
+    ActionChains(page).move_to_element_with_offset(canvas, *to).perform()
     wait_for(page, lambda: page.find_element("id", "value").text != "")
-    said = re.fullmatch(r"\((\d+), (\d+)\): (\S+) electron", page.find_element("id", "value").text)
-    assert (said[1], said[2]) == ("10", "20")
-    assert float(said[3]) == pytest.approx(4050, rel=0.1)
+    said = page.find_element("id", "value").text
+    found = re.fullmatch(r"image \((\d+), (\d+)\): (\S+) electron", said)
+    assert (found[1], found[2]) == ("10", "20")
+    assert float(found[3]) == pytest.approx(4050, rel=0.1)
