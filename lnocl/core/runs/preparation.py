@@ -100,11 +100,7 @@ def _mend_images(plan: Plan) -> tuple[Setup, dict[str, str]]:
     """Return the setup of a plan with images mended, and in words what was."""
     from lnocl.core.runs import mends  # which loads scipy
 
-    steps = {
-        CORES: mends.mask_cores,
-        RAYS: mends.mask_rays,
-        EXPOSURES: mends.fit_exposures,
-    }
+    steps = {CORES: mends.mask_cores, RAYS: mends.mask_rays, EXPOSURES: mends.fit_exposures}
     setup, found = plan.setup, dict[str, str]()
     for step in filter(plan.does, steps):
         setup, found[step] = steps[step](setup)
