@@ -239,7 +239,7 @@ def _found(view: SignificanceView | None) -> str:
         return ""
     parts = ["<h2>Detections and limits</h2>"]
     if view.signal is not None or view.limit is not None:
-        picture = _picture(draw_significance(view))
+        picture = _picture(draw_significance(view, stacked=True))
         parts.append(
             f'<img alt="detections and limits" src="data:image/png;base64,{picture}" '
             'style="max-width:100%">'

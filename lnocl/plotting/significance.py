@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -45,11 +45,13 @@ class SignificanceView:
     signal : ndarray of float64, shape (ny, nx), or None
         Signal-to-noise of a source at each place.
     detections : mapping of str to array_like, or None
-        Columns ``x``, ``y`` and ``kind``.
+        Columns ``x``, ``y`` and ``kind``; and ``star``, ``distance``, ``contrast`` and
+        ``contrast_error`` for the curves.
     limit : ndarray of float64, shape (ny, nx), or None
         Flux that is found with a probability of a half.
     curves : mapping of str to array_like, or None
-        Columns ``star``, ``distance``, and ``magnitudes`` with the probabilities, percent.
+        Columns ``star``, ``distance``, and ``contrast`` with the probabilities, percent; and
+        ``separation``, arcsec, where that is known.
     """
 
     stars: Sequence[tuple[float, float]]
@@ -63,27 +65,28 @@ class SignificanceView:
     curves: Mapping[str, Any] | None = None
 
 
-def draw_significance(view: SignificanceView) -> Figure:
-    """Draw the maps that there are, and the curves of limits, beside each other.
+def draw_significance(view: SignificanceView, stacked: bool = False) -> Figure:
+    """Draw the maps that there are, and the curves of limits, beside or below each other.
 
     Raises
     ------
     LnoclError
         matplotlib is missing.
     """
-    panels: list[Callable[[Axes, SignificanceView], None]] = []
-    if view.signal is not None:
-        panels.append(_draw_signal)
-    if view.limit is not None:
-        panels.append(_draw_limit)
-    if view.curves is not None and any(
+    panels = {"signal": _draw_signal, "limit": _draw_limit, "curves": _draw_curves}
+    has_light = any(
         np.isfinite(values).any()
-        for name, values in view.curves.items()
-        if name.startswith("magnitudes")
-    ):
-        panels.append(_draw_curves)
-    figure = new_figure(6.2 * len(panels), 4.8)
-    for axis, draw in zip(figure.subplots(1, len(panels), squeeze=False)[0], panels, strict=True):
+        for name, values in (view.curves or {}).items()
+        if name.startswith("contrast")
+    )
+    drawn = [
+        draw
+        for name, draw in panels.items()
+        if getattr(view, name) is not None and (has_light or name != "curves")
+    ]
+    rows, columns = (len(drawn), 1) if stacked else (1, len(drawn))
+    figure = new_figure(6.2 * columns, 4.8 * rows)
+    for axis, draw in zip(figure.subplots(rows, columns, squeeze=False).flat, drawn, strict=True):
         draw(axis, view)
     return figure
 
@@ -95,16 +98,7 @@ def _draw_signal(axis: Axes, view: SignificanceView) -> None:
     extent = extent_of(signal.shape, view.oversample)
     shown = show_image(axis, signal, Normalize(-most, most), extent, "RdBu_r")
     axis.figure.colorbar(shown, ax=axis, label="signal-to-noise")
-    _mark_stars(axis, view)
-    n = 0
-    if view.detections is not None:
-        x, y = (np.asarray(view.detections[name], float) for name in "xy")
-        is_point = np.asarray(view.detections["kind"]) == "point"
-        n = len(x)
-        for chosen, marker in ((is_point, "o"), (~is_point, "s")):
-            axis.plot(x[chosen], y[chosen], marker, ms=11, mfc="none", mec="k", mew=1.2)
-        for i in range(min(n, MOST_NUMBERED)):
-            axis.annotate(f"{i + 1}", (x[i], y[i]), (6, 6), textcoords="offset points", fontsize=8)
+    n = _mark_sources(axis, view)
     what = "points" if not view.width else f"sources {view.width:g} pixels wide"
     axis.set_title(
         f"{what}: {n} above {view.threshold:.2f}\ncircles: points; squares: perhaps extended",
@@ -121,39 +115,76 @@ def _draw_limit(axis: Axes, view: SignificanceView) -> None:
     norm = LogNorm(low, max(high, 1.01 * low))
     shown = show_image(axis, limit, norm, extent_of(limit.shape, view.oversample))
     axis.figure.colorbar(shown, ax=axis, label=f"flux ({as_text(view.unit)})")
-    _mark_stars(axis, view)
+    _mark_sources(axis, view)
     axis.set_title("found with a probability of 50 %", fontsize=9)
 
 
 def _draw_curves(axis: Axes, view: SignificanceView) -> None:
     from matplotlib.ticker import LogLocator, NullLocator
 
-    curves = view.curves or {}
-    stars = np.asarray(curves["star"], int)
-    levels = [name[10:] for name in curves if name.startswith("magnitudes")]
-    for i, star in enumerate(np.unique(stars)[:MOST_STARS]):
-        chosen = stars == star
-        distance = np.asarray(curves["distance"], float)[chosen]
+    curves = {name: np.asarray(column) for name, column in (view.curves or {}).items()}
+    axis.set(xscale="log", yscale="log", ylabel="contrast")
+    unit, scale = "pixels", 1.0
+    if "separation" in curves:
+        unit, scale = "arcsec", curves["separation"][0] / curves["distance"][0]
+    levels = [name[8:] for name in curves if name.startswith("contrast")]
+    for i, star in enumerate(np.unique(curves["star"])[:MOST_STARS]):
+        chosen, colour = curves["star"] == star, COLOURS[i % len(COLOURS)]
+        distance = scale * curves["distance"][chosen]
         for k, level in enumerate(levels):
-            values = np.asarray(curves[f"magnitudes{level}"], float)[chosen]
-            label = f"star {star}, {level} %" if not k or not i else None
             axis.plot(
-                distance, values, label=label,
-                color=COLOURS[i % len(COLOURS)], linestyle=STYLES[k % len(STYLES)], lw=1.2,
+                distance, curves[f"contrast{level}"][chosen], lw=1.2, color=colour,
+                linestyle=STYLES[k % len(STYLES)],
+                label=f"star {star}, {level} %" if not k or not i else None,
             )  # fmt: skip
-    axis.set_xlabel("distance from the star (pixels)")
-    axis.set_ylabel("limit (magnitudes below the star)")
-    axis.invert_yaxis()
-    axis.set_xscale("log")
+        _mark_contrasts(axis, view.detections or {}, star, scale, colour)
+    nearest = scale * curves["distance"].min()
+    label = f"inner working angle: {nearest:.3g} {unit}"
+    axis.axvspan(0.8 * nearest, nearest, color="0.85", label=label)
+    axis.set_xlabel(f"separation ({unit})")
+    axis.set_xlim(left=0.8 * nearest)
     axis.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
     axis.xaxis.set_major_formatter("{x:g}")
     axis.xaxis.set_minor_locator(NullLocator())
     axis.grid(alpha=0.3)
-    axis.set_title("limits and the probability of being found", fontsize=9)
+    title = f"limits at {view.threshold:.2f} sigma"
+    axis.set_title(f"{title}\nnear a star by Student's t (Mawet et al. 2014)", fontsize=9)
     axis.legend(fontsize=8)
+    right = axis.twinx()
+    right.set_ylim(*(-2.5 * np.log10(axis.get_ylim())))
+    right.set_ylabel("magnitudes below the star")
 
 
-def _mark_stars(axis: Axes, view: SignificanceView) -> None:
-    for x, y in view.stars:
-        axis.plot(x, y, "+", ms=7, mew=1.0, color=COLOURS[4])
+def _mark_contrasts(
+    axis: Axes, found: Mapping[str, Any], star: int, scale: float, colour: str
+) -> None:
+    """Mark the detections beside a star that are brighter than nothing, with their errors."""
+    names = "distance", "contrast", "contrast_error"
+    if "contrast" not in found:  # in files of before
+        return
+    distance, contrast, error = (np.asarray(found[name], float) for name in names)
+    for i in np.flatnonzero((np.asarray(found["star"]) == star) & (contrast > 0)):
+        marker = "o" if found["kind"][i] == "point" else "s"
+        at = scale * distance[i], contrast[i]
+        axis.errorbar(*at, error[i], fmt=marker, ms=6, mec="k", color=colour, ecolor="k", capsize=3)
+        if i < MOST_NUMBERED:
+            axis.annotate(f"{i + 1}", at, (6, 6), textcoords="offset points", fontsize=8)
+
+
+def _mark_sources(axis: Axes, view: SignificanceView) -> int:
+    """Mark stars and detections of a map, bright and dark; return how many detections it has."""
+    from matplotlib.patheffects import withStroke
+
+    white: Any = {"path_effects": [withStroke(linewidth=2.5, foreground="w")]}
+    for place in view.stars:
+        axis.plot(*place, "+", ms=8, mew=1.2, color="k", **white)
     axis.set(xlabel="x (pixels)", ylabel="y (pixels)")
+    if view.detections is None:
+        return 0
+    places = np.array([view.detections["x"], view.detections["y"]], float).T
+    is_point = np.asarray(view.detections["kind"]) == "point"
+    for chosen, marker in ((is_point, "o"), (~is_point, "s")):
+        axis.plot(*places[chosen].T, marker, ms=11, mfc="none", mec="k", mew=1.2, **white)
+    for i, place in enumerate(places[:MOST_NUMBERED], 1):
+        axis.annotate(f"{i}", place, (6, 6), textcoords="offset points", fontsize=9, **white)
+    return len(places)

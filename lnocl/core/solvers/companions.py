@@ -68,8 +68,8 @@ class Companion(NamedTuple):
 
     place: Array
     flux: float
-    errors: Array
-    significance: float
+    errors: Array = np.zeros(3)
+    significance: float = 0.0
 
 
 def companions(
@@ -117,8 +117,9 @@ def companions(
 def errors_beside(estimate: Estimate, raised: Array | None = None) -> Array:
     """Return the standard errors of points beside the brightest stars, beside all PSFs' errors.
 
-    They are medians at distances from a star, electrons, of the shape of the sky on its grid; 0
-    where no point is looked for.
+    They are those where points are tried, and where they are fitted with their places and have to
+    stand against the extended source: typical ones of each distance from a star, electrons, of
+    shape (2, Ny, Nx) on the grid of the sky; 0 far off, and NaN where a point is part of a star.
 
     Parameters
     ----------
@@ -128,22 +129,35 @@ def errors_beside(estimate: Estimate, raised: Array | None = None) -> Array:
         As of `companions`.
     """
     estimate = _doubted(estimate)
-    scene, errors = estimate.scene, np.zeros(estimate.scene.grid)
+    scene, errors = estimate.scene, np.zeros((2, *estimate.scene.grid))
     around = Surroundings(estimate, False, raised)
     if around.width < NARROWEST:
         return errors
     for star in brightest(estimate):
         near = NearStar(around, star, FINISHED)
         distance, is_tried = _places(around, near, star)
-        at = np.nonzero(is_tried)
-        found = _points(near, estimate, at)[1]
-        ring = np.round(STEPS * distance[at])
-        rings = np.unique(ring)
-        medians = [np.median(found[ring == k]) for k in rings]
-        is_near = (distance > NEAREST) & (distance <= FARTHEST)
-        profile = np.interp(STEPS * distance, rings, medians) if len(rings) else 0.0 * distance
-        there = near.places(scene)
-        errors[there] = np.maximum(errors[there], np.where(is_near, profile, 0.0) * scene.unit)
+        y, x = np.nonzero(is_tried)
+        found, profile = _points(near, estimate, (y, x))[1], []
+        rows, columns = offsets_from(scene, star, near.window)
+        rings = np.round(STEPS * distance[y, x])
+        for k in np.unique(rings):
+            ring = np.flatnonzero(rings == k)
+            i = ring[np.argsort(found[ring])[len(ring) // 2]]
+            place = scene.stars[star] + np.array([columns[x[i]], rows[y[i], 0]]) / scene.oversample
+            point = Companion(place, SIGNIFICANT * found[i] * scene.unit)
+            beside = Surroundings(holding(estimate, [point], around.width), True, raised)
+            fitted = NearStar(beside, scene.n_stars, FINISHED)
+            error = step_of(fitted, scene.n_stars, scene.n_epochs)[1]
+            if np.isfinite(error):
+                profile.append((distance[y[i], x[i]], found[i], error))
+        if profile:
+            at, *logs = np.log(sorted(profile)).T
+            between = np.log(np.maximum(distance, NEAREST))
+            values = [np.exp(np.interp(between, at, each)) * scene.unit for each in logs]
+            for each, value in zip(errors, values, strict=True):
+                value = np.where(distance > FARTHEST, 0.0, value)
+                value[distance <= NEAREST] = np.nan
+                each[near.places(scene)] = np.maximum(each[near.places(scene)], value)
     return errors
 
 
