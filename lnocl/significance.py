@@ -278,17 +278,19 @@ class Significance:
         return np.asarray(tree.query(places)[0] < NEAR * self.resolution)
 
     @cached_property
+    def _with_points(self) -> Estimate:
+        """The estimate that has the points that were found as stars: else they limit others."""
+        estimate, found = self._outcome.estimate, self.detections
+        rows = found[found["kind"] == POINT_SOURCE].iterrows("x", "y", "flux")
+        points = [Companion(np.array([x.value, y.value]), flux.value) for x, y, flux in rows]
+        return holding(estimate, points, self._map.null.resolution) if points else estimate
+
+    @cached_property
     def _beside_points(self) -> ScoreMap:
-        """The score of a source beside the points that were found: else they limit it."""
-        found, null = self.detections, self._map.null
-        points = [
-            Companion(np.array([row["x"].value, row["y"].value]), row["flux"].value)
-            for row in found[found["kind"] == POINT_SOURCE]
-        ]
-        if len(points) * null.scene.n_epochs == null.scene.n_stars - self._outcome.scene.n_stars:
+        """The score of a source beside the points that were found."""
+        if self._with_points.scene.n_stars == self._map.null.scene.n_stars:
             return self._map
-        beside = holding(self._outcome.estimate, points, null.resolution)
-        return ScoreMap(null_of(self._outcome, beside), self._map.width)
+        return ScoreMap(null_of(self._outcome, self._with_points), self._map.width)
 
     @cached_property
     def _at_threshold(self) -> Array:
@@ -311,8 +313,9 @@ class Significance:
         """Standard errors of points near stars, tried and fitted; 0 elsewhere, and of others."""
         if self._map.width:
             return np.zeros((2, *self._map.values.shape))
-        estimate = self._outcome.estimate
-        return errors_beside(estimate, halo_errors(estimate).raised)
+        estimate, raised = self._with_points, halo_errors(self._outcome.estimate).raised
+        is_known = np.arange(estimate.scene.n_stars) < self._outcome.scene.n_stars
+        return errors_beside(estimate, raised, is_known)
 
     def contrast_curves(self, completeness: Sequence[float] | float = (0.5, 0.9, 0.95)) -> QTable:
         """Return the faintest sources that would be found, against the distance from each star.
@@ -348,7 +351,7 @@ class Significance:
         >>> result = lnocl.deconvolve(observation, [(32, 32)], n_iter=20, engine="numpy")
         >>> curves = result.significance().contrast_curves()
         >>> curves.colnames[:4], bool(curves["magnitudes50"][-1].value > 6)
-        (['star', 'distance', 'share', 'flux50'], True)
+        (['star', 'distance', 'share', 'threshold'], True)
         """
         from astropy.table import QTable
         from astropy.units import electron, mag, pix
@@ -441,9 +444,8 @@ def significance(outcome: Outcome, width: float, false_alarms: float) -> Signifi
         )
     table = detections(outcome.estimate, outcome.moves, found, least, beside, null.resolution)
     of_star = fluxes_of_stars(outcome)[table["star"] - 1]
-    table["contrast"], table["contrast_error"] = (
-        table[name].value / of_star for name in ("flux", "flux_error")
-    )
+    for name in ("", "_error"):
+        table[f"contrast{name}"] = table[f"flux{name}"].value / of_star
     return Significance(
         found.significance[:ny, :nx],
         found.fluxes[:ny, :nx],

@@ -209,10 +209,24 @@ def test_contrasts_of_detections_are_over_their_star(found):
     assert source["contrast_error"] == pytest.approx(source["flux_error"].value / of_star)
 
 
+def test_a_companion_does_not_limit_the_ring_that_it_lies_in():
+    """In the sky it raised the error that points have there, to 12 times."""
+    star = point(*STAR, 2e5)
+    alone, beside = (
+        solve(light, [STAR], n_iter=60, smoothing=0.003).significance().contrast_curves(0.5)
+        for light in (star, star + point(46.3, 26.6, 6e3))
+    )
+    near = alone["distance"].value < 12
+    assert alone["distance"][0] == beside["distance"][0]
+    ratio = beside["flux50"][: near.sum()] / alone["flux50"][near]
+    assert (ratio < 2.0).all()
+
+
 def test_what_is_found_does_not_limit_what_lies_beside_it(found):
     """As part of the sky it raised limits to 50 times within ten pixels."""
     limits, (rows, columns) = found.limit(0.5), np.indices((N, N))
     away = np.hypot(columns - 52.4, rows - 40.2)
+    assert found._with_points.scene.n_stars == 1 + (found.detections["kind"] == "point").sum()
     level = np.median(limits[4:10, 50:60])
     assert np.isnan(limits[40, 52])
     beside = (away > 4) & (away < 8)

@@ -141,8 +141,7 @@ def _draw_curves(axis: Axes, view: SignificanceView) -> None:
     nearest = scale * curves["distance"].min()
     label = f"inner working angle: {nearest:.3g} {unit}"
     axis.axvspan(0.8 * nearest, nearest, color="0.85", label=label)
-    axis.set_xlabel(f"separation ({unit})")
-    axis.set_xlim(left=0.8 * nearest)
+    axis.set(xlabel=f"separation ({unit})", xlim=(0.8 * nearest, None))
     axis.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
     axis.xaxis.set_major_formatter("{x:g}")
     axis.xaxis.set_minor_locator(NullLocator())

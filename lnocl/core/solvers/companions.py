@@ -114,7 +114,9 @@ def companions(
     return beside, found
 
 
-def errors_beside(estimate: Estimate, raised: Array | None = None) -> Array:
+def errors_beside(
+    estimate: Estimate, raised: Array | None = None, is_meant: Mask | bool = True
+) -> Array:
     """Return the standard errors of points beside the brightest stars, beside all PSFs' errors.
 
     They are those where points are tried, and where they are fitted with their places and have to
@@ -127,13 +129,15 @@ def errors_beside(estimate: Estimate, raised: Array | None = None) -> Array:
         That of a run with the stars that are known.
     raised : ndarray of float64, shape (n_shapes,), optional
         As of `companions`.
+    is_meant : ndarray of bool, shape (n_stars,), or bool, optional
+        Which stars have points beside them.
     """
     estimate = _doubted(estimate)
     scene, errors = estimate.scene, np.zeros((2, *estimate.scene.grid))
     around = Surroundings(estimate, False, raised)
     if around.width < NARROWEST:
         return errors
-    for star in brightest(estimate):
+    for star in brightest(estimate, is_meant):
         near = NearStar(around, star, FINISHED)
         distance, is_tried = _places(around, near, star)
         y, x = np.nonzero(is_tried)
