@@ -209,6 +209,7 @@ def test_contrasts_of_detections_are_over_their_star(found):
     assert source["contrast_error"] == pytest.approx(source["flux_error"].value / of_star)
 
 
+@pytest.mark.exhaustive
 def test_a_companion_does_not_limit_the_ring_that_it_lies_in():
     """In the sky it raised the error that points have there, to 12 times."""
     star = point(*STAR, 2e5)

@@ -18,11 +18,11 @@ def random_pixels(weights: Array, n: int, rng: np.random.Generator) -> NDArray[n
 
 def parted(places: NDArray[np.int_], apart: float) -> Iterator[list[int]]:
     """Yield numbers of places that lie farther apart than given, together all of them."""
-    left = list(range(len(places)))
-    while left:
-        taken: list[int] = []
-        for i in left:
-            if all(np.hypot(*(places[i] - places[k])) > apart for k in taken):
-                taken.append(i)
+    left = np.arange(len(places))
+    while left.size:
+        taken, free = list[int](), left
+        while free.size:
+            taken.append(int(free[0]))
+            free = free[np.hypot(*(places[free] - places[free[0]]).T) > apart]
         yield taken
-        left = [i for i in left if i not in taken]
+        left = np.setdiff1d(left, taken)
