@@ -392,8 +392,7 @@ class Significance:
     def view(self, unit: str = "electron", **maps: Any) -> SignificanceView:
         """Return what a picture shows: detections, and what is given of maps and curves."""
         scene, found = self._outcome.scene, dict(self.detections.items())
-        stars = [(x, y) for x, y in scene.places.tolist()]
-        shown = stars, scene.oversample, self.threshold, self.width, unit
+        shown = scene.places.tolist(), scene.oversample, self.threshold, self.width, unit
         return SignificanceView(*shown, detections=found, **maps)
 
     def plot(self) -> Figure:

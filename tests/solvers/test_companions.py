@@ -216,3 +216,19 @@ def test_points_are_looked_for_through_psfs_without_the_noise_of_their_wings(mon
     np.testing.assert_array_equal(seen[0], observation.psfs)
     assert noisy.psfs.min() < -1e-4
     assert seen[1].min() >= 0
+
+
+def test_a_point_that_is_not_clear_alone_is_tried_with_the_next(monkeypatch):
+    """A source beside it that is not found yet may hide it, and it that source."""
+    estimate, seen = start(observe()), []
+    points = [room.Companion(np.array(at), 1e4, significance=9.0) for at in ((27, 24), (20, 31))]
+    last = room.Companion(np.zeros(2), 0.0)
+    monkeypatch.setattr(room, "_likeliest", lambda *_: [*points, last][len(seen)])
+
+    def with_points(_, tried, *more):
+        seen.append(list(tried))
+        return (estimate, tried) if len(tried) == 2 else None
+
+    monkeypatch.setattr(room, "_with_points", with_points)
+    assert room.companions(estimate)[1] == points
+    assert seen == [points[:1], points]

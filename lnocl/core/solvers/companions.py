@@ -91,21 +91,22 @@ def companions(
     least : float
         How significant a point must be.
     """
-    beside = estimate = _doubted(estimate)
-    scene, found = estimate.scene, list[Companion]()
+    now = beside = estimate = _doubted(estimate)
+    scene, found, points = estimate.scene, list[Companion](), list[Companion]()
     width = Surroundings(estimate, False).width
     if width < NARROWEST:  # samples do not hold its shape
         return beside, found
     stars = brightest(estimate)
-    while stars and len(found) < MOST_POINTS:
-        around = Surroundings(beside, False, raised)
+    while stars and len(points) < MOST_POINTS:
+        around = Surroundings(now, False, raised)
         likeliest = max((_likeliest(around, star) for star in stars), key=lambda each: each[-1])
         if likeliest.significance <= max(least, SIGNIFICANT):
             break
-        tried = _with_points(estimate, [*found, likeliest], width, raised)
-        if tried is None:
-            break
-        beside, found = tried
+        points = [*points, likeliest]
+        if tried := _with_points(estimate, points, width, raised):
+            now, points = beside, found = tried
+        else:  # beside another, not found yet, it may be clear
+            now = holding(estimate, points, width)
     for point in likely:
         away = [np.hypot(*(point.place - each.place)) for each in found]
         is_new = all(np.array(away) * scene.oversample > NEAREST * width)
