@@ -189,6 +189,16 @@ def test_curves_have_whole_pixels_from_the_inner_working_angle_on(found):
     assert at_ten["flux50"].value == pytest.approx(np.nanmedian(ring), rel=0.05)
 
 
+def test_curves_begin_where_half_of_a_ring_is_tested(found):
+    maps, (rows, columns) = np.ones((2, N, N)), np.indices((N, N))
+    maps[:, (np.hypot(columns - 30, rows - 30) < 7.5) & (columns > 28)] = np.nan
+    assert next(found._rings(np.array([30.0, 30.0]), maps))[:2] == (8.0, 1.0)
+    maps[:, columns > 32] = 1.0
+    distance, share, *_ = next(found._rings(np.array([30.0, 30.0]), maps))
+    assert distance < 8
+    assert 0.5 <= share < 1
+
+
 def test_rings_near_a_star_need_more_as_they_hold_few_independent_places(found):
     """Student's distribution asks for more than the threshold there, and not far off."""
     least = found.contrast_curves(0.5)["threshold"]
