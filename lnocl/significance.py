@@ -9,12 +9,14 @@ whole field (`lnocl.detection.false_alarms`).
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import KDTree
 from scipy.stats import norm
 
 from lnocl.core.runs.outcome import Outcome, mean_over_epochs
@@ -23,8 +25,9 @@ from lnocl.core.scene.detector import on_sky
 from lnocl.core.scene.estimate import Estimate
 from lnocl.core.scene.quantities import in_unit
 from lnocl.core.scene.texture import SHARE_NEAR
-from lnocl.core.solvers.companions import SIGNIFICANT, errors_beside
+from lnocl.core.solvers.companions import SIGNIFICANT, Companion, errors_beside, holding
 from lnocl.core.solvers.halos import halo_errors
+from lnocl.detection.places import parted, random_pixels
 from lnocl.detection.score import Null
 from lnocl.detection.score_map import ScoreMap
 from lnocl.detection.table import CLEAR, POINT_SOURCE, detections, points_beside_stars
@@ -39,8 +42,16 @@ if TYPE_CHECKING:
 NEAR = 0.7
 # Of more false alarms in a field the number is not what the threshold says.
 MOST_ALARMS = 10.0
+# Curves have each pixel up to one, then each tenth, from where this share of a ring is tested.
+EACH_PIXEL, TENTHS, HALF = 100, 10, 0.5
 # The threshold of fewer is beyond what numbers hold.
 FEWEST_ALARMS = 1e-200
+
+
+def fluxes_of_stars(outcome: Outcome) -> Array:
+    """Return the flux of each star, electrons, NaN where it has none, and NaN after the last."""
+    fluxes = mean_over_epochs(outcome.fluxes_of_stars, outcome.observation.n_epochs)
+    return np.append(np.where(fluxes > 0, fluxes, np.nan), np.nan)
 
 
 def null_of(outcome: Outcome, estimate: Estimate | None = None) -> Null:
@@ -77,9 +88,10 @@ class Significance:
     detections : astropy.table.QTable
         The maxima above the threshold, most significant first: ``x``, ``y`` and their errors,
         pixels of the images; ``flux`` and ``flux_error``, electrons; ``significance``; the nearest
-        ``star``, counted from 1, or 0, and its ``distance``, pixels; and ``kind``. That is "point"
-        for a point source, and "extended" where the extended source could be it. The flux of
-        the latter is that of a point there, beside an extended source as bright as it is round it.
+        ``star``, counted from 1, or 0, and its ``distance``, pixels; ``kind``; and
+        ``contrast`` and ``contrast_error``, over the flux of that star. The kind is "point" for a
+        point source, and "extended" where the extended source could be it. The flux of the latter
+        is that of a point there, beside an extended source as bright as it is round it.
 
     See Also
     --------
@@ -130,7 +142,6 @@ class Significance:
     width: float
     resolution: float
     detections: QTable
-    _null: Null = field(repr=False)
     _map: ScoreMap = field(repr=False)
     _outcome: Outcome = field(repr=False)
 
@@ -151,8 +162,10 @@ class Significance:
         ndarray of float64, of the shape of the extended source
             Electrons; NaN where the images do not tell a source from stars. The extended source is
             allowed for where it is: a point has to be three errors above what that may be. Near a
-            star it has to be five, or the threshold, above all that PSFs may have wrong, as points
-            are tried there (`lnocl.core.solvers.companions`).
+            star it has to be five, or the threshold, above all that PSFs may have wrong, and three
+            above that and the extended source, as points are tried and fitted there
+            (`lnocl.core.solvers.companions`). Points that were found are part of the model, and a
+            source at one of them is not told from it.
 
         Raises
         ------
@@ -173,26 +186,22 @@ class Significance:
         """
         completeness = in_unit("completeness", completeness, "")
         number_in("completeness", completeness, "between 0 and 1", lambda given: 0 < given < 1)
-        found, outcome = self._map, self._outcome
-        fluxes = np.maximum(
-            found.needed(self._at_threshold, completeness), self._flux_distinct_from_source
-        )
-        least = max(self.threshold, SIGNIFICANT) + norm.ppf(completeness)
-        fluxes = np.maximum(fluxes, least * self._beside_psfs)
-        ny, nx = outcome.observation.sky_shape
-        return np.asarray(fluxes[:ny, :nx])
+        found = self._beside_points
+        fluxes = found.needed(self._at_threshold, completeness), self._flux_distinct_from_source
+        (tried, fitted), least = self._beside_psfs, max(self.threshold, SIGNIFICANT)
+        beside = np.maximum(least * tried, CLEAR * fitted) + norm.ppf(completeness) * tried
+        ny, nx = self.signal_to_noise.shape
+        return np.asarray(np.maximum(np.maximum(*fluxes), beside)[:ny, :nx])
 
     def inject(
-        self,
-        n: int = 100,
-        completeness: float = 0.5,
-        seed: int = 0,
-        progress: bool = False,
+        self, n: int = 100, completeness: float = 0.5, seed: int = 0, progress: bool = False
     ) -> QTable:
         """Put sources into the images, and return which of them are found.
 
-        They lie at random where sources are tested, with fluxes that `limit` says are found with
-        this probability. A few at a time, the reconstruction is made again with them.
+        They lie at random where sources are tested, as many between 3 and 6 pixels from a star as
+        between 30 and 60; without stars they lie all over the field. The fluxes are those that
+        `limit` says are found with this probability. A few at a time, the reconstruction is made
+        again with them.
 
         Parameters
         ----------
@@ -208,9 +217,9 @@ class Significance:
         Returns
         -------
         astropy.table.QTable
-            A row for each source: ``x`` and ``y``, pixels of the images; ``flux``, electrons; and
-            ``found``, whether a detection lies within 0.7 resolutions; a point, where points are
-            put in.
+            A row for each source: ``x`` and ``y``, pixels of the images; ``distance`` from the
+            nearest star, infinite without one; ``flux``, electrons; and ``found``, whether a
+            detection lies within 0.7 resolutions; a point, where points are put in.
 
         Raises
         ------
@@ -232,43 +241,61 @@ class Significance:
         """
         from astropy.table import QTable
         from astropy.units import electron, pix
+        from scipy.ndimage import map_coordinates
 
-        from lnocl.core.runs.injections import APART, Injections, spread_places
+        from lnocl.core.runs.injections import APART, Injections
         from lnocl.progress import Progress
 
         check_injections(n, seed)
-        limits, observation = self.limit(completeness), self._outcome.observation
-        allowed = np.isfinite(limits)
+        limits, rng = self.limit(completeness), np.random.default_rng(seed)
+        scene, q, allowed = self._outcome.scene, self._outcome.scene.oversample, np.isfinite(limits)
         if not allowed.any():
             raise InputError("sources are tested nowhere, so that none can be put in")
-        q, rng = observation.oversample, np.random.default_rng(seed)
-        injections = Injections(self._outcome, self.width * q)
-        rows: list[tuple[float, float, float, bool]] = []
-        apart = APART * self.resolution * q
+        stars = KDTree(on_sky(scene.places, q)[:, ::-1])
+        distance = stars.query(np.moveaxis(np.indices(limits.shape), 0, -1))[0]
+        weights = allowed / np.clip(distance, 1.0, max(limits.shape)) ** 2
+        pixels = random_pixels(weights, n, rng)
+        places = pixels + rng.uniform(-0.5, 0.5, pixels.shape)
+        between = np.exp(map_coordinates(np.log(limits), places.T, order=1, mode="nearest"))
+        fluxes = np.where(np.isfinite(between), between, limits[*pixels.T])
+        distance = stars.query(places)[0] / q
+        places = (places[:, ::-1] - (q - 1) / 2.0) / q
+        injections, found = Injections(self._outcome, self.width * q), np.zeros(n, bool)
         with Progress(n, "source", progress, "sources put in") as bar:
-            while len(rows) < n:
-                pixels = np.array(list(spread_places(allowed, n - len(rows), apart, rng)))
-                fluxes = limits[pixels[:, 0], pixels[:, 1]]
-                places = pixels[:, ::-1] + rng.uniform(-0.5, 0.5, pixels.shape)
-                places = (places - (q - 1) / 2.0) / q
-                is_found = self._finds(places, injections.reconstruct(places, fluxes, rng))
-                rows += zip(*places.T.tolist(), fluxes.tolist(), is_found, strict=True)
-                bar.update(len(places))
-        x, y, flux, found = map(np.array, zip(*rows, strict=True))
-        return QTable({"x": x * pix, "y": y * pix, "flux": flux * electron, "found": found})
+            for few in parted(pixels, APART * self.resolution * q):
+                outcome = injections.reconstruct(places[few], fluxes[few], rng)
+                found[few] = self._finds(places[few], outcome)
+                bar.update(len(few))
+        columns = {"x": places[:, 0] * pix, "y": places[:, 1] * pix, "distance": distance * pix}
+        return QTable({**columns, "flux": fluxes * electron, "found": found})
 
-    def _finds(self, places: Array, outcome: Outcome) -> list[bool]:
+    def _finds(self, places: Array, outcome: Outcome) -> NDArray[np.bool_]:
         """Return whether there is a detection at each of some places of a reconstruction."""
         found = significance(outcome, self.width, self.false_alarms).detections
         if not self.width:
             found = found[found["kind"] == POINT_SOURCE]
-        away = [np.hypot(found["x"].value - x, found["y"].value - y) for x, y in places]
-        return [bool((each < NEAR * self.resolution).any()) for each in away]
+        tree = KDTree(np.array([found["x"].value, found["y"].value]).T)
+        return np.asarray(tree.query(places)[0] < NEAR * self.resolution)
+
+    @cached_property
+    def _with_points(self) -> Estimate:
+        """The estimate that has the points that were found as stars: else they limit others."""
+        estimate, found = self._outcome.estimate, self.detections
+        rows = found[found["kind"] == POINT_SOURCE].iterrows("x", "y", "flux")
+        points = [Companion(np.array([x.value, y.value]), flux.value) for x, y, flux in rows]
+        return holding(estimate, points, self._map.null.resolution) if points else estimate
+
+    @cached_property
+    def _beside_points(self) -> ScoreMap:
+        """The score of a source beside the points that were found."""
+        if self._with_points.scene.n_stars == self._map.null.scene.n_stars:
+            return self._map
+        return ScoreMap(null_of(self._outcome, self._with_points), self._map.width)
 
     @cached_property
     def _at_threshold(self) -> Array:
-        """The values of tested places that are worth the threshold, in units of their noise."""
-        return self._map.values_at(self.threshold)
+        """The values that are worth the threshold at each place, in units of its noise."""
+        return self._beside_points.values_at(self.threshold)
 
     @cached_property
     def _flux_distinct_from_source(self) -> Array:
@@ -278,15 +305,17 @@ class Significance:
         """
         if self._map.width:
             return np.zeros(self._map.values.shape)
-        return np.asarray(CLEAR * SHARE_NEAR * self._null.brightest_structure() * self._map.unit)
+        brightest = self._beside_points.null.brightest_structure()
+        return np.asarray(CLEAR * SHARE_NEAR * brightest * self._map.unit)
 
     @cached_property
     def _beside_psfs(self) -> Array:
-        """The standard error of a point near a star beside what PSFs may have wrong, else 0."""
+        """Standard errors of points near stars, tried and fitted; 0 elsewhere, and of others."""
         if self._map.width:
-            return np.zeros(self._map.values.shape)
-        estimate = self._outcome.estimate
-        return errors_beside(estimate, halo_errors(estimate).raised)
+            return np.zeros((2, *self._map.values.shape))
+        estimate, raised = self._with_points, halo_errors(self._outcome.estimate).raised
+        is_known = np.arange(estimate.scene.n_stars) < self._outcome.scene.n_stars
+        return errors_beside(estimate, raised, is_known)
 
     def contrast_curves(self, completeness: Sequence[float] | float = (0.5, 0.9, 0.95)) -> QTable:
         """Return the faintest sources that would be found, against the distance from each star.
@@ -299,11 +328,12 @@ class Significance:
         Returns
         -------
         astropy.table.QTable
-            A row for each ring round each ``star``, counted from 1. Rings are a resolution wide:
-            their mean ``distance``, pixels of the images, and ``share``, how much of each is
-            tested. Then the medians of `limit` in it: ``flux50``, electrons; ``contrast50``, over
-            the flux of the star; and ``magnitudes50``, fainter than the star; likewise for other
-            probabilities.
+            A row for each ``distance`` from each ``star``, counted from 1: each whole pixel of the
+            images up to 100, then each tenth. The first is the inner working angle, at which half
+            of the ring is tested. All are of a ring a pixel wide: the ``share`` of it that is
+            tested; the median ``threshold``, in standard errors, of a detection in it; and the
+            medians of `limit`: ``flux50``, electrons; ``contrast50``, over the flux of the star;
+            and ``magnitudes50``, fainter than the star; likewise for other probabilities.
 
         Raises
         ------
@@ -321,7 +351,7 @@ class Significance:
         >>> result = lnocl.deconvolve(observation, [(32, 32)], n_iter=20, engine="numpy")
         >>> curves = result.significance().contrast_curves()
         >>> curves.colnames[:4], bool(curves["magnitudes50"][-1].value > 6)
-        (['star', 'distance', 'share', 'flux50'], True)
+        (['star', 'distance', 'share', 'threshold'], True)
         """
         from astropy.table import QTable
         from astropy.units import electron, mag, pix
@@ -329,49 +359,41 @@ class Significance:
         shares = np.atleast_1d(in_unit("completeness", completeness, "")).tolist()
         found = [self.limit(each) for each in shares]
         limits = {f"{100 * each:g}": limit for each, limit in zip(shares, found, strict=True)}
-        observation, scene = self._outcome.observation, self._outcome.scene
-        n_epochs = observation.n_epochs
-        fluxes = mean_over_epochs(self._outcome.fluxes_of_stars, n_epochs)
+        ny, nx = self.signal_to_noise.shape
+        maps = np.array([self._at_threshold[:ny, :nx], *limits.values()])
+        scene, of_stars = self._outcome.scene, fluxes_of_stars(self._outcome)
         rows: list[tuple[float, ...]] = []
-        for s, place in enumerate(on_sky(scene.stars[::n_epochs], observation.oversample)):
-            rows += [(float(s + 1), *ring, float(fluxes[s])) for ring in self._rings(place, limits)]
-        names = ["star", "distance", "share", *(f"flux{name}" for name in limits), "of_star"]
-        columns = dict(zip(names, np.reshape(rows, (-1, len(names))).T, strict=True))
-        table = QTable({
-            "star": columns["star"].astype(int),
-            "distance": columns["distance"] * pix,
-            "share": columns["share"],
-        })  # fmt: skip
-        of_star = np.where(columns["of_star"] > 0, columns["of_star"], np.nan)
-        for name in limits:
-            table[f"flux{name}"] = columns[f"flux{name}"] * electron
-            table[f"contrast{name}"] = columns[f"flux{name}"] / of_star
+        for s, place in enumerate(on_sky(scene.places, scene.oversample)):
+            rows += [(s + 1.0, *ring, of_stars[s]) for ring in self._rings(place, maps)]
+        star, distance, share, least, *fluxes, of_star = np.reshape(rows, (-1, len(maps) + 4)).T
+        table = QTable({"star": star.astype(int), "distance": distance * pix})
+        table["share"], table["threshold"] = share, least
+        for name, flux in zip(limits, fluxes, strict=True):
+            table[f"flux{name}"] = flux * electron
+            table[f"contrast{name}"] = flux / of_star
             table[f"magnitudes{name}"] = -2.5 * np.log10(table[f"contrast{name}"]) * mag
         return table
 
-    def _rings(self, place: Array, limits: Mapping[str, Array]) -> Iterator[tuple[float, ...]]:
-        """Yield distance, share that is tested, and medians of limits of rings round a place."""
-        q = self._outcome.observation.oversample
+    def _rings(self, place: Array, maps: Array) -> Iterator[tuple[float, ...]]:
+        """Yield distance, share that is tested, and medians of maps in rings round a place."""
         from scipy.ndimage import value_indices
 
-        rows, columns = np.indices(self.signal_to_noise.shape)
-        distance = np.hypot(rows - place[1], columns - place[0]) / q
-        ring = (distance / self.resolution).astype(int)
-        is_tested = np.isfinite(self.signal_to_noise)
-        sizes = np.bincount(ring.ravel())
-        rings = value_indices(np.where(is_tested, ring, -1), ignore_value=-1)
+        away = np.indices(maps.shape[1:]) - place[::-1, None, None]
+        ring = np.round(np.hypot(*away) / self._outcome.scene.oversample).astype(int)
+        is_listed = (ring <= EACH_PIXEL) | (ring % TENTHS == 0)
+        is_tested, sizes = np.isfinite(maps[1]), np.bincount(ring.ravel())
+        rings, has_begun = value_indices(ring * (is_listed & is_tested), ignore_value=0), False
         for k, there in sorted(rings.items()):
-            medians = (float(np.median(each[there])) for each in limits.values())
-            yield float(distance[there].mean()), len(there[0]) / float(sizes[k]), *medians
+            share = len(there[0]) / float(sizes[k])
+            has_begun |= share >= HALF
+            if has_begun:
+                yield float(k), share, *np.median(maps[:, *there], axis=1).tolist()
 
-    def view(self, curves: QTable | None = None) -> SignificanceView:
-        """Return what the picture of detections, and of limits with their curves, shows."""
-        observation, scene = self._outcome.observation, self._outcome.scene
-        stars = [(x, y) for x, y in scene.stars[:: observation.n_epochs].tolist()]
-        shown = stars, observation.oversample, self.threshold, self.width, "electron"
-        if curves is None:
-            return SignificanceView(*shown, self.signal_to_noise, _plain(self.detections))
-        return SignificanceView(*shown, limit=self.limit(), curves=_plain(curves))
+    def view(self, unit: str = "electron", **maps: Any) -> SignificanceView:
+        """Return what a picture shows: detections, and what is given of maps and curves."""
+        scene, found = self._outcome.scene, dict(self.detections.items())
+        shown = scene.places.tolist(), scene.oversample, self.threshold, self.width, unit
+        return SignificanceView(*shown, detections=found, **maps)
 
     def plot(self) -> Figure:
         """Return a picture of the map with the detections, and of the limits and their curves.
@@ -396,8 +418,8 @@ class Significance:
         >>> [axes.get_title()[:9] for axes in result.significance().plot().axes[:1]]
         ['points: 0']
         """
-        curves = self.contrast_curves()
-        view = replace(self.view(), limit=self.limit(), curves=_plain(curves))
+        curves = dict(self.contrast_curves().items())
+        view = self.view(signal=self.signal_to_noise, limit=self.limit(), curves=curves)
         return draw_significance(view)
 
 
@@ -419,6 +441,10 @@ def significance(outcome: Outcome, width: float, false_alarms: float) -> Signifi
             f"nowhere do the images tell a source of `width` {width:g} pixels from stars, the "
             "level of the sky and edges: give a narrower one, or a larger field"
         )
+    table = detections(outcome.estimate, outcome.moves, found, least, beside, null.resolution)
+    of_star = fluxes_of_stars(outcome)[table["star"] - 1]
+    for name in ("", "_error"):
+        table[f"contrast{name}"] = table[f"flux{name}"].value / of_star
     return Significance(
         found.significance[:ny, :nx],
         found.fluxes[:ny, :nx],
@@ -427,16 +453,10 @@ def significance(outcome: Outcome, width: float, false_alarms: float) -> Signifi
         false_alarms,
         width,
         null.resolution / observation.oversample,
-        detections(outcome.estimate, outcome.moves, found, least, beside, null.resolution),
-        null,
+        table,
         found,
         outcome,
     )
-
-
-def _plain(table: QTable) -> dict[str, Array]:
-    """Return the columns of a table as arrays, without units."""
-    return {name: np.asarray(table[name]) for name in table.colnames}
 
 
 def check_search(width: object, false_alarms: object) -> None:

@@ -9,14 +9,15 @@ import pytest
 from scipy import ndimage
 
 import lnocl
-from lnocl.core.runs.injections import Injections, spread_places
+from lnocl.core.runs.injections import Injections
 from lnocl.core.scene.estimate import Estimate
 from lnocl.core.scene.scene import Scene
 from lnocl.core.solvers.psf_errors import PsfErrors
+from lnocl.detection.places import parted, random_pixels
 from lnocl.detection.point_test import point_flux
 from lnocl.errors import InputError
 from lnocl.process import ignored_warnings
-from lnocl.significance import significance
+from lnocl.significance import Significance, significance
 
 ROWS, COLUMNS = np.indices((33, 33)) - 16
 RADIUS = np.hypot(ROWS, COLUMNS)
@@ -173,7 +174,75 @@ def test_limits_rise_with_completeness_and_towards_the_star(found):
     assert curves["flux50"][0] > 3 * curves["flux50"][-1]
     expected = -2.5 * np.log10(curves["flux50"].value / found._outcome.star_fluxes[0])
     np.testing.assert_allclose(curves["magnitudes50"].value, expected)
-    assert (np.diff(curves["distance"].value) > 0).all()
+
+
+def test_curves_have_whole_pixels_from_the_inner_working_angle_on(found):
+    curves = found.contrast_curves(0.5)
+    distance = curves["distance"].value
+    assert distance.tolist() == list(range(int(distance[0]), int(distance[-1]) + 1))
+    limits, (rows, columns) = found.limit(0.5), np.indices((N, N))
+    away = np.hypot(columns - found._outcome.scene.stars[0, 0], rows - STAR[1])
+    within = np.isfinite(limits)[abs(away - distance[0] + 1) <= 0.5]
+    assert within.mean() < 0.5 <= curves["share"][0]
+    [at_ten] = curves[distance == 10]
+    ring = limits[abs(away - 10) <= 0.5]
+    assert at_ten["flux50"].value == pytest.approx(np.nanmedian(ring), rel=0.05)
+
+
+def test_curves_begin_where_half_of_a_ring_is_tested(found):
+    maps, (rows, columns) = np.ones((2, N, N)), np.indices((N, N))
+    maps[:, (np.hypot(columns - 30, rows - 30) < 7.5) & (columns > 28)] = np.nan
+    assert next(found._rings(np.array([30.0, 30.0]), maps))[:2] == (8.0, 1.0)
+    maps[:, columns > 32] = 1.0
+    distance, share, *_ = next(found._rings(np.array([30.0, 30.0]), maps))
+    assert distance < 8
+    assert 0.5 <= share < 1
+
+
+def test_rings_near_a_star_need_more_as_they_hold_few_independent_places(found):
+    """Student's distribution asks for more than the threshold there, and not far off."""
+    least = found.contrast_curves(0.5)["threshold"]
+    assert least[0] > 1.2 * found.threshold
+    assert least[-1] == pytest.approx(found.threshold, rel=0.05)
+
+
+def test_far_curves_have_each_tenth_pixel(found, monkeypatch):
+    monkeypatch.setattr("lnocl.significance.EACH_PIXEL", 7)
+    distance = found.contrast_curves(0.5)["distance"].value
+    assert distance[distance > 7].tolist() == [10, 20, 30, 40, 50]
+
+
+def test_contrasts_of_detections_are_over_their_star(found):
+    [source] = near(found.detections, 52.4, 40.2)
+    of_star = found._outcome.star_fluxes[0]
+    assert source["contrast"] == pytest.approx(source["flux"].value / of_star)
+    assert source["contrast_error"] == pytest.approx(source["flux_error"].value / of_star)
+
+
+@pytest.mark.exhaustive
+def test_a_companion_does_not_limit_the_ring_that_it_lies_in():
+    """In the sky it raised the error that points have there, to 12 times."""
+    star = point(*STAR, 2e5)
+    alone, beside = (
+        solve(light, [STAR], n_iter=60, smoothing=0.003).significance().contrast_curves(0.5)
+        for light in (star, star + point(46.3, 26.6, 6e3))
+    )
+    near = alone["distance"].value < 12
+    assert alone["distance"][0] == beside["distance"][0]
+    ratio = beside["flux50"][: near.sum()] / alone["flux50"][near]
+    assert (ratio < 2.0).all()
+
+
+def test_what_is_found_does_not_limit_what_lies_beside_it(found):
+    """As part of the sky it raised limits to 50 times within ten pixels."""
+    limits, (rows, columns) = found.limit(0.5), np.indices((N, N))
+    away = np.hypot(columns - 52.4, rows - 40.2)
+    assert found._with_points.scene.n_stars == 1 + (found.detections["kind"] == "point").sum()
+    level = np.median(limits[4:10, 50:60])
+    assert np.isnan(limits[40, 52])
+    beside = (away > 4) & (away < 8)
+    assert np.isfinite(limits[beside]).all()
+    assert 0.8 * level < np.median(limits[beside]) < 1.3 * level
 
 
 def test_the_limit_of_a_half_is_about_the_threshold(found):
@@ -183,16 +252,17 @@ def test_the_limit_of_a_half_is_about_the_threshold(found):
 
 
 def test_points_near_a_star_are_five_errors_above_what_psfs_may_have_wrong(found, monkeypatch):
-    error = np.zeros(found._map.values.shape)
+    """And, fitted, three above that and what the extended source may be."""
+    error, limits = np.zeros(found._map.values.shape), []
     error[20:24, 43:46] = 1e5
-    limits = []
-    for beside_psfs in (np.zeros_like(error), error):
-        monkeypatch.setattr("lnocl.significance.errors_beside", lambda *_, e=beside_psfs: e)
+    for tried, fitted in ((0, 0), (1, 0), (1, 1.5), (1, 3)):
+        errors = np.array([tried * error, fitted * error])
+        monkeypatch.setattr("lnocl.significance.errors_beside", lambda *_, e=errors: e)
         limits.append(replace(found).limit(0.9))
-    before, after = limits
     beside = error[:N, :N] > 0
-    np.testing.assert_allclose(after[beside], (5 + 1.2815516) * 1e5)
-    np.testing.assert_array_equal(after[~beside], before[~beside])
+    for after, least in zip(limits[1:], (5, 5, 9), strict=True):
+        np.testing.assert_allclose(after[beside], (least + 1.2815516) * 1e5)
+        np.testing.assert_array_equal(after[~beside], limits[0][~beside])
 
 
 def test_a_jet_limits_points_on_it(found):
@@ -222,13 +292,39 @@ def test_sources_that_are_put_in_have_their_counts(result):
 
 
 def test_places_lie_apart_and_where_they_may():
-    allowed = np.zeros((50, 60), bool)
-    allowed[5:40, 5:50] = True
-    places = np.array(list(spread_places(allowed, 6, 10.0, np.random.default_rng(2))))
-    assert allowed[tuple(places.T)].all()
-    away = np.hypot(*(places[:, None] - places).transpose(2, 0, 1))
-    assert (away[np.triu_indices(len(places), 1)] > 10).all()
-    assert not list(spread_places(allowed & False, 6, 10.0, np.random.default_rng(2)))
+    weights = np.zeros((50, 60))
+    weights[5:40, 5:30], weights[5:40, 30:50] = 3.0, 1.0
+    places = random_pixels(weights, 400, np.random.default_rng(2))
+    assert (weights[*places.T] > 0).all()
+    assert np.mean(weights[*places.T] == 3) == pytest.approx(75 / 95, abs=0.06)
+    groups = list(parted(places, 10.0))
+    assert sorted(i for group in groups for i in group) == list(range(400))
+    for group in groups:
+        away = np.hypot(*(places[group][:, None] - places[group]).transpose(2, 0, 1))
+        assert (away[np.triu_indices(len(group), 1)] > 10).all()
+    assert len(groups[0]) > 5
+
+
+@pytest.mark.parametrize("has_star", [True, False])
+def test_sources_are_put_in_where_curves_are_drawn(found, has_star, monkeypatch):
+    """As many at 4 to 8 pixels from a star as at 8 to 16, with the limits of their places."""
+    monkeypatch.setattr(Injections, "__init__", lambda *_: None)
+    monkeypatch.setattr(Injections, "reconstruct", lambda *_: None)
+    monkeypatch.setattr(Significance, "_finds", lambda self, places, _: places[:, 0] > 30)
+    if not has_star:
+        found = solve(np.zeros((N, N))).significance()
+    table = found.inject(800, 0.5, seed=1)
+    x, y, distance = (table[name].value for name in ("x", "y", "distance"))
+    assert (table["found"] == (x > 30)).all()
+    pixels = np.round([y, x]).astype(int)
+    assert np.median(table["flux"].value / found.limit(0.5)[*pixels]) == pytest.approx(1, abs=0.05)
+    if has_star:
+        np.testing.assert_allclose(distance, np.hypot(*(x, y) - found._outcome.scene.stars.T))
+        counts = np.histogram(distance, [4, 8, 16])[0]
+        assert counts[0] == pytest.approx(counts[1], rel=0.25)
+    else:
+        assert np.isinf(distance).all()
+        assert np.mean(x > 31.5) == pytest.approx(0.5, abs=0.06)
 
 
 def test_bad_pixels_and_a_finer_sky():
@@ -322,14 +418,25 @@ def test_the_picture_has_the_map_the_limits_and_the_curves(found):
     assert titles[0].startswith(f"points: {len(found.detections)} above {found.threshold:.2f}")
     assert titles[1:] == [
         "found with a probability of 50 %",
-        "limits and the probability of being found",
+        f"limits at {found.threshold:.2f} sigma\nnear a star by Student's t (Mawet et al. 2014)",
     ]
+    axes = {axes.get_ylabel(): axes for axes in figure.axes}
+    curves, magnitudes = axes["contrast"], axes["magnitudes below the star"]
+    assert curves.get_xlabel() == "separation (pixels)"
+    np.testing.assert_allclose(magnitudes.get_ylim(), -2.5 * np.log10(curves.get_ylim()))
+    marked = {(*line.get_xydata()[0],) for line in curves.lines if len(line.get_xydata()) == 1}
+    bright = found.detections[found.detections["contrast"] > 0]
+    points = set(zip(bright["distance"].value, bright["contrast"], strict=True))
+    assert len(points) >= 3
+    assert points <= marked
+    iwa = found.contrast_curves(0.5)["distance"][0].value
+    assert f"inner working angle: {iwa:g} pixels" in curves.get_legend_handles_labels()[1]
 
 
 def test_one_probability_has_its_curves(found):
     one, listed = found.contrast_curves(0.7), found.contrast_curves([0.7])
     assert one.colnames == listed.colnames
-    assert one.colnames[3:] == ["flux70", "contrast70", "magnitudes70"]
+    assert one.colnames[4:] == ["flux70", "contrast70", "magnitudes70"]
     assert (one["flux70"] == listed["flux70"]).all()
 
 

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from astropy.table import QTable
 
     from lnocl.io.frames import Frames
+    from lnocl.plotting.significance import SignificanceView
     from lnocl.significance import Significance
 
 SOURCES = (
@@ -45,7 +46,8 @@ def _run(arguments: argparse.Namespace) -> list[str]:
     table, unit = in_unit(found.detections, again.frames), again.frames.unit
     parts = {"DETECTIONS": table, "SIGNAL": found.signal_to_noise}
     add_parts(again.saved, parts, cards(found, unit), unit)
-    return finish(arguments, found, table, "detections", _summary_lines(found, table))
+    view = found.view(signal=found.signal_to_noise)
+    return finish(arguments, view, table, "detections", _summary_lines(found, table))
 
 
 def find(arguments: argparse.Namespace, content: str) -> tuple[Significance, RerunOfFile]:
@@ -69,7 +71,7 @@ def find(arguments: argparse.Namespace, content: str) -> tuple[Significance, Rer
 
 
 def in_unit(table: QTable, frames: Frames) -> QTable:
-    """Return a table with its fluxes in the unit of the images, and places on the sky if known."""
+    """Return a table with its fluxes in the unit of the images, and angles on the sky if known."""
     from astropy import units as u
 
     from lnocl.io import sky
@@ -81,6 +83,9 @@ def in_unit(table: QTable, frames: Frames) -> QTable:
     if "x" in table.colnames and len(table) and sky.has_celestial(frames.header):
         places = np.array([table["x"].value, table["y"].value]).T
         table["ra"], table["dec"] = sky.to_sky(places, frames.header).T * u.deg
+    if scale := sky.pixel_scale(frames.header):
+        separation, at = scale * table["distance"].value * u.arcsec, table.index_column("distance")
+        table.add_column(separation, at + 1, "separation")
     return table
 
 
@@ -96,16 +101,12 @@ def cards(found: Significance, unit: str) -> list[tuple[str, Any, str]]:
 
 def finish(
     arguments: argparse.Namespace,
-    found: Significance,
+    view: SignificanceView,
     table: QTable,
     content: str,
     lines: Sequence[str],
-    curves: QTable | None = None,
 ) -> list[str]:
-    """Write table and picture where they are asked for; return the lines, and what was done.
-
-    The picture is that of limits where their curves are given.
-    """
+    """Write table and picture where they are asked for; return the lines, and what was done."""
     said = [*lines, f"added to {arguments.result}"]
     if arguments.output is not None:
         from lnocl.io.tables import write_table
@@ -116,7 +117,7 @@ def finish(
     if arguments.plot is not None:
         from lnocl.plotting.significance import draw_significance
 
-        said.append(pictures.draw(arguments, draw_significance(found.view(curves))))
+        said.append(pictures.draw(arguments, draw_significance(view)))
     return said
 
 

@@ -20,6 +20,11 @@ if TYPE_CHECKING:
 
 # Probabilities of being found at which sources are put in.
 PUT_IN = 0.5, 0.9
+# Distances from a star at which limits are said, pixels.
+SHOWN = 3, 5, 10, 20, 50, 100, 200, 500, 1000
+COLUMNS = "star", "distance", "separation", "threshold", "contrast50", "magnitudes50", "contrast90"
+# Sources within so many resolutions of a star are counted apart.
+NEAR = 3.0
 # A share that is found is not the stated one where it is as rare as this.
 RARE = 1e-3
 
@@ -58,59 +63,61 @@ def _run(arguments: argparse.Namespace) -> list[str]:
     check_injections(arguments.injections or 1, arguments.seed)
     found, again = detect.find(arguments, "limits")
     frames = again.frames
-    curves = found.contrast_curves([each / 100 for each in COMPLETENESS])
-    table = detect.in_unit(curves, frames)
+    table = detect.in_unit(found.contrast_curves([each / 100 for each in COMPLETENESS]), frames)
     maps = {f"LIMIT{each}": found.limit(each / 100) / frames.electrons for each in COMPLETENESS}
     cards = detect.cards(found, frames.unit)
     add_parts(again.saved, {"LIMITS": table, **maps}, cards, frames.unit)
     lines = _summary_lines(found, table, maps["LIMIT50"], frames.unit)
     with ignored_notes():
         lines += _checked(found, arguments)
-    return detect.finish(arguments, found, table, "limits", lines, curves)
+    view = found.view(frames.unit, limit=maps["LIMIT50"], curves=dict(table.items()))
+    return detect.finish(arguments, view, table, "limits", lines)
 
 
 def _summary_lines(found: Significance, table: QTable, limit: np.ndarray, unit: str) -> list[str]:
-    """Return a line for the whole field, and one for each star."""
+    """Return a line for the whole field, and some rows of the curves."""
     what = f"source {found.width:g} pixels wide" if found.width else "point"
     lines = [
         f"a {what} of {np.nanmedian(limit):.4g} {unit} is found with a probability of 50 % (median "
         f"of the field), at {found.false_alarms:g} false alarms in the field"
     ]
-    stars = np.unique(table["star"])
-    for star in stars[stars > 0][: detect.MAX_LISTED]:
-        rows = table[table["star"] == star]
-        if not np.isfinite(rows["magnitudes50"].value).any():
-            lines.append(f"star {star} has no light, and nothing is faint beside it")
-            continue
-        shown = rows[np.unique(np.round(np.geomspace(1, len(rows), 4)).astype(int)) - 1]
-        limits = ", ".join(
-            f"{row['magnitudes50'].value:.2f} at {row['distance'].value:.1f}" for row in shown
-        )
-        lines.append(f"star {star}: magnitudes below it, at pixels from it: {limits}")
-    return lines
+    is_lit = np.isfinite(table["contrast50"])
+    dark = np.setdiff1d(table["star"], table["star"][is_lit])
+    lines += [f"star {star} has no light, and nothing is faint beside it" for star in dark]
+    # Rows begin at the inner working angle.
+    is_shown = (np.diff(table["star"], prepend=0) > 0) | np.isin(table["distance"].value, SHOWN)
+    names = [name for name in COLUMNS if name in table.colnames]
+    shown = table[names][is_lit & is_shown & (table["star"] <= detect.MAX_LISTED)]
+    for name in names[1:]:
+        shown[name].info.format = ".3g"
+    return lines + shown.pformat(max_lines=-1, max_width=-1) if len(shown) else lines
 
 
 def _checked(found: Significance, arguments: argparse.Namespace) -> list[str]:
     """Put sources in, and return how many of them are found."""
     from scipy.stats import binom
 
-    lines = []
+    lines, close = [], NEAR * found.resolution
     numbers = (arguments.injections + 1) // 2, arguments.injections // 2
     for n, share in zip(numbers, PUT_IN, strict=True):
         if not n:
             continue
         sources = found.inject(n, share, arguments.seed, not arguments.quiet)
-        k = int(sources["found"].sum())
-        error = np.sqrt(share * (1.0 - share) / n)
-        lines.append(
-            f"of {n} sources put in at the limit of {100 * share:g} %, {k} are found: "
-            f"{100 * k / n:.0f} +- {100 * error:.0f} %"
-        )
-        if binom.cdf(k, n, share) < RARE:
-            warn(
-                f"the limit of {100 * share:g} % is too faint: of {n} sources put in {k} are found;"
-                " trust only the limits that injections show"
+        near = sources[sources["distance"].value < close]
+        for some, where in ((sources, ""), (near, f" within {close:.1f} pixels of a star")):
+            n, k = len(some), int(some["found"].sum())
+            if not n:
+                continue
+            error = np.sqrt(share * (1.0 - share) / n)
+            lines.append(
+                f"of {n} sources put in{where} at the limit of {100 * share:g} %, {k} are found: "
+                f"{100 * k / n:.0f} +- {100 * error:.0f} %"
             )
+            if binom.cdf(k, n, share) < RARE:
+                warn(
+                    f"the limit of {100 * share:g} % is too faint{where}: of {n} sources put in "
+                    f"{k} are found; trust only the limits that injections show"
+                )
     return lines
 
 

@@ -11,7 +11,6 @@ from typing import NamedTuple
 
 import numpy as np
 import scipy.linalg
-from numpy.typing import NDArray
 from scipy import ndimage
 
 from lnocl.core.scene.apertures import FWHM
@@ -167,18 +166,18 @@ class KnownStars:
                     found[j][there] += errors[np.minimum(ring, len(errors) - 1)] ** 2 * squares
         return list(found), list(whole)
 
-    def rings(self, width: float) -> NDArray[np.int_]:
-        """Return the ring, so many pixels wide, round the star that lights each place most."""
+    def rings(self, width: float) -> Array:
+        """Return distances from the star that lights each place most, in so many pixels."""
         scene = self._scene
-        brightest, ring = np.zeros(scene.grid), np.zeros(scene.grid, int)
+        brightest, ring = np.zeros(scene.grid), np.full(scene.grid, np.hypot(*scene.grid) / width)
         fluxes = self._fluxes * scene.transmitted(scene.stars).mean(axis=0)
         for s, flux in enumerate(fluxes):
             cutout = scene.psf_on_sky(0, s)
             there = cutout.window(scene.grid)
             distance = _distance(cutout, on_sky(scene.stars[s], scene.oversample))
-            light = flux * cutout.values
+            light = abs(flux * cutout.values)
             is_brighter = light > brightest[there]
-            ring[there] = np.where(is_brighter, (distance / width).astype(int), ring[there])
+            ring[there] = np.where(is_brighter, distance / width, ring[there])
             brightest[there] = np.maximum(brightest[there], light)
         return ring
 

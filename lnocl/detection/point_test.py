@@ -21,11 +21,7 @@ FINISHED = 1e-4
 
 
 def point_flux(
-    estimate: Estimate,
-    place: Array,
-    flux: float,
-    moves: bool,
-    raised: Array,
+    estimate: Estimate, place: Array, flux: float, moves: bool, raised: Array
 ) -> tuple[float, float]:
     """Return the flux of a point at a place and its standard error, electrons.
 
@@ -43,7 +39,7 @@ def point_flux(
         As of `lnocl.core.solvers.halos.halo_errors`: halos are unknown too.
     """
     scene = estimate.scene
-    point = Companion(place, max(flux, 0.0), np.zeros(3), 0.0)
+    point = Companion(place, max(flux, 0.0))
     other = holding(estimate, [point], resolution(scene))
     around = Surroundings(other, moves, raised, holds_shapes=True)
     near = NearStar(around, scene.n_stars, FINISHED)

@@ -174,18 +174,13 @@ class Null:
         Radius of the disc whose level is taken out, pixels of the sky.
     stars : KnownStars
         Of the model.
-    rings : ndarray of int, shape (Ny, Nx)
-        The ring that each place lies in, round the star that lights it most.
+    rings : ndarray of float64, shape (Ny, Nx)
+        Distances from the star that lights each place most, resolutions.
     is_structured : ndarray of bool, shape (Ny, Nx)
         Where the sky has more than its level.
     """
 
-    def __init__(
-        self,
-        estimate: Estimate,
-        moves: bool,
-        psf_errors: tuple[Array, Array],
-    ) -> None:
+    def __init__(self, estimate: Estimate, moves: bool, psf_errors: tuple[Array, Array]) -> None:
         self.scene = scene = estimate.scene
         self._model = Model(scene)
         self.resolution, self.disc = resolution(scene), DISC * coarseness(scene)

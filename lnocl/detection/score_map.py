@@ -35,11 +35,10 @@ class ScoreMap:
     """
 
     def __init__(self, null: Null, width: float) -> None:
-        self.score, self.width = null.score(width), width
-        scene = null.scene
+        self.null, self.score, self.width = null, null.score(width), width
         self.noise = noise_of(self.score, null.rings, ~null.is_structured)
         self._rarity = Rarity(null.kernel(self.score.foremost, width))
-        self.unit = scene.unit
+        self.unit = null.scene.unit
         self.values = self.score.values / self.noise.scatter
         self.values[~self.score.is_tested] = 0.0
 
@@ -86,16 +85,18 @@ class ScoreMap:
         return threshold(alarms, float(cells), edge)
 
     def values_at(self, least: float) -> Array:
-        """Return the values of tested places whose Gaussian values are a threshold, shape (n,)."""
+        """Return the values whose Gaussian values are a threshold at each place."""
         at = np.nonzero(self.score.is_tested)
-        return values_at(least, lambda each: self.rarity(each, at), len(at[0]))
+        found = np.full(self.values.shape, np.nan)
+        found[at] = values_at(least, lambda each: self.rarity(each, at), len(at[0]))
+        return found
 
     def needed(self, values: Array, probability: float) -> Array:
-        """Return the fluxes, electrons, that exceed such values with this probability."""
+        """Return the fluxes, electrons, that exceed values with this probability."""
         at = np.nonzero(self.score.is_tested)
         skewness = self.score.skewness[at] / self.noise.scatter[at]
         found = np.full(self.values.shape, np.nan)
-        found[at] = needed(values, skewness, probability) * self.errors[at]
+        found[at] = needed(values[at], skewness, probability) * self.errors[at]
         return found
 
     def light_round(self, place: Array, value: float, resolution: float) -> float:

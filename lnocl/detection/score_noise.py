@@ -8,7 +8,8 @@ what the ring shows,
 .. math:: \Big\langle \frac{u^2}{1 + e^2 X} \Big\rangle = 1,
 
 whichever is more. A ring has few independent values, so that its score follows Student's
-distribution, as contrasts near a star do (Mawet, D., et al., 2014, ApJ 792, 97).
+distribution, as contrasts near a star do (Mawet, D., et al., 2014, ApJ 792, 97). Each place has a
+ring round it, and a prior says that errors are about a tenth at most.
 """
 
 from __future__ import annotations
@@ -32,6 +33,8 @@ CLEARLY = 4.0
 POSSIBLE, TELLING = 0.1, 0.1
 # What the run has found of the PSFs counts as so many values of a ring.
 KNOWN = 10.0
+# Rings, a unit wide, begin at so many places in a unit.
+STEPS = 4
 # The median of squares of a Gaussian.
 MEDIAN_SQUARE = 0.4549
 # Degrees of freedom that are as many as infinite.
@@ -53,15 +56,15 @@ class Noise(NamedTuple):
     degrees: Array
 
 
-def noise_of(score: Score, rings: NDArray[np.int_], empty: NDArray[np.bool_] | None) -> Noise:
+def noise_of(score: Score, rings: Array, empty: NDArray[np.bool_] | None) -> Noise:
     """Return the noise of a score near stars, and of its whole field.
 
     Parameters
     ----------
     score : Score
         The score of a source.
-    rings : ndarray of int, shape (Ny, Nx)
-        The ring round a star that each place lies in.
+    rings : ndarray of float64, shape (Ny, Nx)
+        The radius, in widths of a ring, of that round a star that each place lies in.
     empty : ndarray of bool, shape (Ny, Nx), or None
         Where no structure was found; None where it is not known yet, so that medians stand for
         means.
@@ -73,14 +76,17 @@ def noise_of(score: Score, rings: NDArray[np.int_], empty: NDArray[np.bool_] | N
     scatter = shared * np.sqrt(1.0 + score.of_psfs)
     degrees = np.full(values.shape, MANY)
     is_near = (POSSIBLE**2 * score.starlit > TELLING) & score.is_tested
-    for there in value_indices(np.where(is_near, rings, -1), ignore_value=-1).values():
-        told_by = is_empty[there]
-        squares, light = (values[there] / shared) ** 2, score.starlit[there]
-        square, told = 0.0, 0.0
-        if told_by.any():
-            square = _error_in(squares[told_by], light[told_by], empty is None)
-            shares = light[told_by] / (1.0 + square * light[told_by])
-            told = independent * float((shares**2).sum())
+    told_by = is_near & is_empty
+    outwards = np.argsort(rings[told_by])
+    radius, lights = rings[told_by][outwards], score.starlit[told_by][outwards]
+    squares = (values[told_by][outwards] / shared) ** 2
+    steps = np.round(STEPS * np.where(is_near, rings, -1.0)).astype(int)
+    for k, there in value_indices(steps, ignore_value=-STEPS).items():
+        ring = slice(*np.searchsorted(radius, (k / STEPS - 0.5, k / STEPS + 0.5)))
+        square = _error_in(squares[ring], lights[ring], empty is None)
+        shares = lights[ring] / (1.0 + square * lights[ring])
+        told = independent * float((shares**2).sum()) + 2.0 / max(square, POSSIBLE**2) ** 2
+        light = score.starlit[there]
         total = 1.0 + np.maximum(square * light, score.of_psfs[there])
         scatter[there] = shared * np.sqrt(total)
         degrees[there] = np.minimum(KNOWN + (total / light) ** 2 * told, MANY)
@@ -102,7 +108,7 @@ def _error_in(squares: Array, light: Array, by_median: bool) -> float:
     def excess(square: float) -> float:
         return float(middle(squares / (1.0 + square * light))) - expected
 
-    if excess(0.0) <= 0:
+    if not squares.size or excess(0.0) <= 0:
         return 0.0
     high = 1.0 / light.max()
     while excess(high) > 0:

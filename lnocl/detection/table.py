@@ -118,26 +118,14 @@ def detections(
     spread = np.sqrt(np.diagonal(np.linalg.inv(curvature), axis1=1, axis2=2))[:, ::-1]
     ratio = np.maximum(found.fluxes[at] / found.errors[at], 1.0)
     moved = np.hypot(spread / ratio[:, None], INTERPOLATED) / q
-    pixels = np.concatenate([pixels, np.reshape([each.place for each in beside], (-1, 2))])
-    fluxes = np.append(fluxes, [each.flux for each in beside])
-    errors = np.append(errors, [each.errors[0] for each in beside])
-    moved = np.concatenate([moved, np.reshape([each.errors[1:] for each in beside], (-1, 2))])
-    gaussian = np.append(gaussian, [each.significance for each in beside])
-    kinds = np.append(kinds, [POINT_SOURCE] * len(beside))
-    stars = scene.stars[:: scene.n_epochs]
-    distance, nearest = KDTree(stars).query(pixels)
-    table = QTable(
-        {
-            "x": pixels[:, 0] * pix,
-            "y": pixels[:, 1] * pix,
-            "x_error": moved[:, 0] * pix,
-            "y_error": moved[:, 1] * pix,
-            "flux": fluxes * electron,
-            "flux_error": errors * electron,
-            "significance": gaussian,
-            "star": np.where(np.isfinite(distance), nearest + 1, 0),
-            "distance": distance * pix,
-            "kind": kinds,
-        }
-    )
+    points = [(*p.place, *p.errors[1:], p.flux, p.errors[0], p.significance) for p in beside]
+    rows = [*zip(*pixels.T, *moved.T, fluxes, errors, gaussian, strict=True), *points]
+    names = "x", "y", "x_error", "y_error", "flux", "flux_error", "significance"
+    units = [*[pix] * 4, electron, electron, None]
+    table = QTable(np.reshape(rows, (-1, len(names))), names=names, units=units)
+    pixels = np.stack([table["x"].value, table["y"].value], axis=1)
+    distance, nearest = KDTree(scene.places).query(pixels)
+    table["star"] = np.where(np.isfinite(distance), nearest + 1, 0)
+    table["distance"] = distance * pix
+    table["kind"] = np.append(kinds, [POINT_SOURCE] * len(beside))
     return table[np.argsort(-table["significance"], kind="stable")]

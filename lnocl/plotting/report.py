@@ -93,7 +93,7 @@ def make_report(
     }
     figures = {"Stars": _drawn(light_curves.draw, view.light_curves)} if view.light_curves else {}
     if found is not None and (found.signal is not None or found.limit is not None):
-        figures["Detections" if "Detections" in tables else "Limits"] = draw_significance(found)
+        figures["Detections" if "Detections" in tables else "Limits"] = draw_significance(found, 1)
     choice = _drawn(result.draw_choice, view) if view.held_out or view.history else None
     template = Template((files("lnocl.plotting") / "report.html").read_text("utf-8"))
     return template.substitute(

@@ -44,11 +44,13 @@ class SignificanceView:
     signal : ndarray of float64, shape (ny, nx), or None
         Signal-to-noise of a source at each place.
     detections : mapping of str to array_like, or None
-        Columns ``x``, ``y`` and ``kind``.
+        Columns ``x``, ``y`` and ``kind``; and ``star``, ``distance``, ``contrast`` and
+        ``contrast_error`` for the curves.
     limit : ndarray of float64, shape (ny, nx), or None
         Flux that is found with a probability of a half.
     curves : mapping of str to array_like, or None
-        Columns ``star``, ``distance``, and ``magnitudes`` with the probabilities, percent.
+        Columns ``star``, ``distance``, and ``contrast`` with the probabilities, percent; and
+        ``separation``, arcsec, where that is known.
     """
 
     stars: Sequence[tuple[float, float]]
@@ -62,8 +64,8 @@ class SignificanceView:
     curves: Mapping[str, Any] | None = None
 
 
-def draw_significance(view: SignificanceView) -> Figure:
-    """Draw the maps that there are, and the curves of limits, two in a row.
+def draw_significance(view: SignificanceView, n_columns: int = 2) -> Figure:
+    """Draw the maps that there are, and the curves of limits, so many in a row at most.
 
     Raises
     ------
@@ -71,14 +73,15 @@ def draw_significance(view: SignificanceView) -> Figure:
         matplotlib is missing.
     """
     curves = view.curves or {}
-    magnitudes = [curves[name] for name in curves if name.startswith("magnitudes")]
+    contrasts = [curves[name] for name in curves if name.startswith("contrast")]
     wanted = {
         _draw_signal: view.signal is not None,
         _draw_limit: view.limit is not None,
-        _draw_curves: np.isfinite(magnitudes).any(),
+        _draw_curves: np.isfinite(contrasts).any(),
     }
     panels = [draw for draw, is_there in wanted.items() if is_there]
-    n_rows, n_columns = -(-len(panels) // 2), min(len(panels), 2)
+    n_columns = min(len(panels), n_columns)
+    n_rows = -(-len(panels) // n_columns)
     figure = new_figure(6.2 * n_columns, 4.8 * n_rows)
     for k, draw in enumerate(panels, 1):
         draw(figure.add_subplot(n_rows, n_columns, k), view)
@@ -92,17 +95,7 @@ def _draw_signal(axis: Axes, view: SignificanceView) -> None:
     extent = extent_of(signal.shape, view.oversample)
     shown = show_image(axis, signal, Normalize(-most, most), extent, "RdBu_r")
     axis.figure.colorbar(shown, ax=axis, label="signal-to-noise")
-    _mark_stars(axis, view)
-    n = 0
-    if view.detections is not None:
-        x, y = (np.asarray(view.detections[name], float) for name in "xy")
-        is_point = np.asarray(view.detections["kind"]) == "point"
-        n = len(x)
-        for chosen, marker in ((is_point, "o"), (~is_point, "s")):
-            axis.plot(x[chosen], y[chosen], marker, ms=11, mfc="none", mec="k", mew=1.2)
-        for i in range(min(n, MOST_NUMBERED)):
-            style = {"textcoords": "offset points", "fontsize": 8, **outlined("black", "white")}
-            axis.annotate(f"{i + 1}", (x[i], y[i]), (6, 6), **style)
+    n = _mark_sources(axis, view)
     what = "points" if not view.width else f"sources {view.width:g} pixels wide"
     title = f"{what}: {n} above {view.threshold:.2f}\ncircles: points; squares: perhaps extended"
     axis.set_title(title, fontsize=9)
@@ -117,39 +110,73 @@ def _draw_limit(axis: Axes, view: SignificanceView) -> None:
     norm = LogNorm(low, max(high, 1.01 * low))
     shown = show_image(axis, limit, norm, extent_of(limit.shape, view.oversample))
     axis.figure.colorbar(shown, ax=axis, label=f"flux ({as_text(view.unit)})")
-    _mark_stars(axis, view)
+    _mark_sources(axis, view)
     axis.set_title("found with a probability of 50 %", fontsize=9)
 
 
 def _draw_curves(axis: Axes, view: SignificanceView) -> None:
     from matplotlib.ticker import LogLocator, NullLocator
 
-    curves = view.curves or {}
-    stars = np.asarray(curves["star"], int)
-    levels = [name[10:] for name in curves if name.startswith("magnitudes")]
-    for i, star in enumerate(np.unique(stars)[:MOST_STARS]):
-        chosen = stars == star
-        distance = np.asarray(curves["distance"], float)[chosen]
+    curves = {name: np.asarray(column) for name, column in (view.curves or {}).items()}
+    axis.set(xscale="log", yscale="log", ylabel="contrast")
+    unit, scale = "pixels", 1.0
+    if "separation" in curves:
+        unit, scale = "arcsec", curves["separation"][0] / curves["distance"][0]
+    levels = [name[8:] for name in curves if name.startswith("contrast")]
+    for i, star in enumerate(np.unique(curves["star"])[:MOST_STARS]):
+        chosen, colour = curves["star"] == star, COLOURS[i % len(COLOURS)]
+        distance = scale * curves["distance"][chosen]
         for k, level in enumerate(levels):
-            values = np.asarray(curves[f"magnitudes{level}"], float)[chosen]
-            label = f"star {star}, {level} %" if not k or not i else None
             axis.plot(
-                distance, values, label=label,
-                color=COLOURS[i % len(COLOURS)], linestyle=STYLES[k % len(STYLES)], lw=1.2,
+                distance, curves[f"contrast{level}"][chosen], lw=1.2, color=colour,
+                linestyle=STYLES[k % len(STYLES)],
+                label=f"star {star}, {level} %" if not k or not i else None,
             )  # fmt: skip
-    axis.set_xlabel("distance from the star (pixels)")
-    axis.set_ylabel("limit (magnitudes below the star)")
-    axis.invert_yaxis()
-    axis.set_xscale("log")
+        _mark_contrasts(axis, view.detections or {}, star, scale, colour)
+    nearest = scale * curves["distance"].min()
+    label = f"inner working angle: {nearest:.3g} {unit}"
+    axis.axvspan(0.8 * nearest, nearest, color="0.85", label=label)
+    axis.set(xlabel=f"separation ({unit})", xlim=(0.8 * nearest, None))
     axis.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
     axis.xaxis.set_major_formatter("{x:g}")
     axis.xaxis.set_minor_locator(NullLocator())
     axis.grid(alpha=0.3)
-    axis.set_title("limits and the probability of being found", fontsize=9)
+    title = f"limits at {view.threshold:.2f} sigma"
+    axis.set_title(f"{title}\nnear a star by Student's t (Mawet et al. 2014)", fontsize=9)
     axis.legend(fontsize=8)
+    right = axis.twinx()
+    right.set_ylim(*(-2.5 * np.log10(axis.get_ylim())))
+    right.set_ylabel("magnitudes below the star")
 
 
-def _mark_stars(axis: Axes, view: SignificanceView) -> None:
-    for x, y in view.stars:
-        axis.plot(x, y, "+", ms=7, mew=1.0, color=COLOURS[4])
+def _mark_contrasts(
+    axis: Axes, found: Mapping[str, Any], star: int, scale: float, colour: str
+) -> None:
+    """Mark the detections beside a star that are brighter than nothing, with their errors."""
+    names = "distance", "contrast", "contrast_error"
+    if "contrast" not in found:  # in files of before
+        return
+    distance, contrast, error = (np.asarray(found[name], float) for name in names)
+    for i in np.flatnonzero((np.asarray(found["star"]) == star) & (contrast > 0)):
+        marker = "o" if found["kind"][i] == "point" else "s"
+        at = scale * distance[i], contrast[i]
+        axis.errorbar(*at, error[i], fmt=marker, ms=6, mec="k", color=colour, ecolor="k", capsize=3)
+        if i < MOST_NUMBERED:
+            axis.annotate(f"{i + 1}", at, (6, 6), textcoords="offset points", fontsize=8)
+
+
+def _mark_sources(axis: Axes, view: SignificanceView) -> int:
+    """Mark stars and detections of a map, bright and dark; return how many detections it has."""
+    dark = outlined("black", "white")
+    for place in view.stars:
+        axis.plot(*place, "+", ms=8, mew=1.2, **dark)
     axis.set(xlabel="x (pixels)", ylabel="y (pixels)")
+    if view.detections is None:
+        return 0
+    places = np.array([view.detections["x"], view.detections["y"]], float).T
+    is_point = np.asarray(view.detections["kind"]) == "point"
+    for chosen, marker in ((is_point, "o"), (~is_point, "s")):
+        axis.plot(*places[chosen].T, marker, ms=11, mfc="none", mew=1.2, **dark)
+    for i, place in enumerate(places[:MOST_NUMBERED], 1):
+        axis.annotate(f"{i}", place, (6, 6), textcoords="offset points", fontsize=9, **dark)
+    return len(places)

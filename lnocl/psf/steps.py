@@ -106,11 +106,7 @@ def _distance(shape: tuple[int, ...], starts: list[Pixel]) -> NDArray[np.int_]:
 
 
 def measure_background(
-    background: float | str,
-    pixels: Array,
-    bad: Mask,
-    starts: list[Pixel],
-    half: int | None,
+    background: float | str, pixels: Array, bad: Mask, starts: list[Pixel], half: int | None
 ) -> tuple[float, str]:
     """Return the background: as given, or the median around the crops or in the border."""
     if not isinstance(background, str):

@@ -45,11 +45,7 @@ def write_simulation(
     for j, (image, psf, angle) in enumerate(
         zip(simulation.images, simulation.psfs, angles, strict=True), 1
     ):
-        both: list[fitswrite.Card] = [
-            creator,
-            scale,
-            ("ANGLE", angle, "of the baseline, degrees"),
-        ]
+        both: list[fitswrite.Card] = [creator, scale, ("ANGLE", angle, "of the baseline, degrees")]
         taken: list[fitswrite.Card] = [
             ("BUNIT", "electron", "per pixel"),
             ("EXPTIME", float(how.exposure_time.to_value("s")), "seconds"),

@@ -50,6 +50,7 @@ def test_detections_are_said_written_and_added(output, capsys):
     assert table["kind"].tolist() == ["point"]
     assert abs(table["flux"][0] - 3000) < 4 * table["flux_error"][0]
     assert table["ra"][0] == pytest.approx(15.25 - 14e-4, abs=2e-5)
+    assert table["separation"][0] == pytest.approx(0.36 * table["distance"][0])
     held = read_parts("out.fits", ["DETECTIONS", "SIGNAL"])
     found, cards = held["DETECTIONS"]
     assert cards["THRESHOL"] == pytest.approx(float(said[0].split()[3]), abs=0.01)
@@ -98,10 +99,12 @@ def test_limits_are_said_written_added_and_checked(capsys):
     said = capsys.readouterr().out.splitlines()
     assert said[0].startswith("a point of ")
     assert said[0].endswith("at 0.01 false alarms in the field")
-    assert said[1].startswith("star 1: magnitudes below it, at pixels from it: ")
-    assert said[2].startswith("of 6 sources put in at the limit of 50 %, ")
-    assert said[3].startswith("of 5 sources put in at the limit of 90 %, ")
-    assert said[4:] == ["added to out.fits", "written to limits.ecsv"]
+    end = said.index("added to out.fits")
+    assert said[end:] == ["added to out.fits", "written to limits.ecsv"]
+    put_in = [line for line in said if " put in" in line]
+    assert put_in[0].startswith("of 6 sources put in at the limit of 50 %, ")
+    assert any(" put in within " in line and "of a star at the limit" in line for line in put_in)
+    assert any(line.startswith("of 5 sources put in at the limit of 90 %, ") for line in put_in)
     table = Table.read("limits.ecsv")
     assert {"star", "distance", "flux50", "contrast90", "magnitudes95"} <= set(table.colnames)
     assert (table["flux95"] > table["flux50"]).all()
@@ -115,6 +118,25 @@ def test_limits_are_said_written_added_and_checked(capsys):
 def test_no_sources_are_put_in_where_none_are_wanted(capsys):
     assert cli.main(["limit", "out.fits", "--injections", "0"]) == 0
     assert "put in" not in capsys.readouterr().out
+
+
+def test_limits_are_said_at_round_distances(capsys):
+    assert cli.main(["limit", "out.fits", "--injections", "0", "-o", "limits.ecsv"]) == 0
+    said = capsys.readouterr().out.splitlines()
+    (names, units), rows = (line.split() for line in said[1:3]), said[4:-2]
+    assert names[:4] == ["star", "distance", "separation", "threshold"]
+    assert units == ["pix", "arcsec", "mag"]
+    table, shown = (
+        Table.read("limits.ecsv"),
+        [dict(zip(names, row.split(), strict=True)) for row in rows],
+    )
+    assert [float(row["distance"]) for row in shown[-4:]] == [5, 10, 20, 50]
+    assert float(shown[0]["distance"]) == table["distance"][0]
+    for row in shown:
+        [of_curve] = table[table["distance"] == float(row["distance"])]
+        assert float(row["separation"]) == pytest.approx(0.36 * of_curve["distance"], rel=5e-3)
+        for name in ("contrast50", "magnitudes50", "contrast90"):
+            assert float(row[name]) == pytest.approx(of_curve[name], rel=1e-2)
 
 
 @pytest.mark.exhaustive

@@ -487,7 +487,7 @@ def noisy(error, told=0.0, shared=1.0, seed=0):
     correlation[0, 0] = 1.0
     is_tested = np.ones((n, n), bool)
     score = _Score(u, told**2 * light, light, is_tested, correlation)
-    return score, (distance / 3).astype(int), light
+    return score, distance / 3, light
 
 
 @pytest.mark.parametrize("by_median", [False, True])
@@ -499,8 +499,24 @@ def test_rings_show_the_error_of_psfs(error, by_median):
     near = (rings >= 2) & (rings <= 8)
     assert np.median(found.scatter[near] / expected[near]) == pytest.approx(1.0, abs=0.12)
     assert (found.scatter >= 1.0).all()
-    assert found.degrees[rings == 1].max() < 200
+    assert found.degrees[(rings >= 1) & (rings < 2)].max() < 200
     assert (found.degrees[light < 1.0] == 1e6).all()
+
+
+def test_noise_of_rings_is_known_as_well_at_all_their_radii():
+    """Rings side by side, each with its own degrees, rose by half from one edge to the next."""
+    score, rings, light = noisy(0.0)
+    found = noise_of(score, rings, score.is_tested)
+    is_near = light > 20.0
+    radii = np.round(3 * rings).astype(int)
+    degrees = np.array([np.median(found.degrees[is_near & (radii == r)]) for r in range(3, 25)])
+    assert degrees[0] < 100
+    assert (degrees[1:] > 0.8 * degrees[:-1]).all()
+    correlation = np.zeros_like(light)
+    correlation[:10, :10] = 1.0  # so that a ring tells next to nothing
+    found = noise_of(score._replace(correlation=correlation), rings, score.is_tested)
+    is_faint = (light > 10.0) & (light < 20.0)
+    assert found.degrees[is_faint].min() > 50  # what it adds is known not to be much
 
 
 def test_what_the_run_has_found_of_psfs_is_the_least():

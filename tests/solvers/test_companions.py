@@ -151,19 +151,33 @@ def test_fluxes_are_those_of_least_squares_with_all_unknowns():
     assert errors[0] == pytest.approx(expected, rel=1e-6)
 
 
+def test_points_that_are_fitted_have_the_errors_that_limits_have():
+    """A companion of a flux beside the star is found where it is three of them, and no less."""
+    place, estimate = (28.2, 25.2), start(observe())
+    errors = room.errors_beside(estimate)[1]
+    error = errors[round(place[1]), round(place[0])]
+    now = room.holding(estimate, [room.Companion(np.array(place), 5 * error)], 3.0)
+    near = NearStar(Surroundings(now, True), 1, 1e-3)
+    assert room.step_of(near, 1, 1)[1] * now.scene.unit == pytest.approx(error, rel=0.25)
+
+
 def test_errors_beside_a_star_are_those_of_points_at_like_distances():
     estimate = start(observe())
-    errors = room.errors_beside(estimate)[:N, :N]
+    errors, fitted = room.errors_beside(estimate)[:, :N, :N]
     near = NearStar(Surroundings(estimate, False), 0, 1e-3)
     away = R / near.resolution
-    assert (errors[(away <= 0.5) | (away > 3.0)] == 0).all()
+    is_near = (away > 0.5) & (away <= 3.0)
+    for each in (errors, fitted):
+        assert (each[away > 3.0] == 0).all()
+        assert np.isnan(each[away <= 0.5]).all()
+    assert (fitted[is_near] > errors[is_near]).mean() > 0.9
     top, left = near.window[:2]
     for distance in (1.0, 2.0):
         y, x = np.nonzero(abs(away - distance) < 0.1)
         rows, columns = y - top, x - left
         of_points = room._points(near, estimate, (rows, columns))[1] * estimate.scene.unit
-        assert np.median(errors[y, x]) == pytest.approx(np.median(of_points), rel=0.1)
-    exact = room.errors_beside(start(observe(error=0.0)))[:N, :N]
+        assert np.median(errors[y, x]) == pytest.approx(np.median(of_points), rel=0.15)
+    exact = room.errors_beside(start(observe(error=0.0)))[0, :N, :N]
     beside = abs(away - 1) < 0.3
     assert (errors[beside] > 3 * exact[beside]).all()
 
@@ -202,3 +216,19 @@ def test_points_are_looked_for_through_psfs_without_the_noise_of_their_wings(mon
     np.testing.assert_array_equal(seen[0], observation.psfs)
     assert noisy.psfs.min() < -1e-4
     assert seen[1].min() >= 0
+
+
+def test_a_point_that_is_not_clear_alone_is_tried_with_the_next(monkeypatch):
+    """A source beside it that is not found yet may hide it, and it that source."""
+    estimate, seen = start(observe()), []
+    points = [room.Companion(np.array(at), 1e4, significance=9.0) for at in ((27, 24), (20, 31))]
+    last = room.Companion(np.zeros(2), 0.0)
+    monkeypatch.setattr(room, "_likeliest", lambda *_: [*points, last][len(seen)])
+
+    def with_points(_, tried, *more):
+        seen.append(list(tried))
+        return (estimate, tried) if len(tried) == 2 else None
+
+    monkeypatch.setattr(room, "_with_points", with_points)
+    assert room.companions(estimate)[1] == points
+    assert seen == [points[:1], points]

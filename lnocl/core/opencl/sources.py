@@ -31,13 +31,7 @@ SOURCES = (
 
 # Kernels that one program has: those that a run needs first, and those that it needs last; a third
 # has all others. What a run has no use for is not compiled, and two may be compiled at once.
-FIRST = (
-    "rfft_rows",
-    "otf_columns",
-    "convolve_columns",
-    "correlate_columns",
-    "ratio_rows",
-)
+FIRST = ("rfft_rows", "otf_columns", "convolve_columns", "correlate_columns", "ratio_rows")
 LAST = "smooth", "collect_sums", "gradient_rows", "step_rows", "follow_stars"
 KERNEL = re.compile(r"^KERNEL void (\w+)\(([^)]*)\).*?^}\n", re.MULTILINE | re.DOTALL)
 

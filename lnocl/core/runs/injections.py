@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
 import numpy as np
 
 from lnocl.core.runs.outcome import Outcome
@@ -13,8 +11,6 @@ from lnocl.core.scene.arrays import Array
 
 # Sources of one image lie so many resolutions apart, so that none is in the level round another.
 APART = 9.0
-# Places that are tried for one more source.
-TRIES = 50
 
 
 class Injections:
@@ -62,19 +58,3 @@ class Injections:
         means = [scene.in_electrons(each, j)[:ny, :nx] for j, each in enumerate(light)]
         counts = rng.poisson(np.maximum(means, 0.0)).astype(np.float64)
         return np.where(observation.mask, 0.0, counts)
-
-
-def spread_places(
-    allowed: Array, n: int, apart: float, rng: np.random.Generator
-) -> Iterator[tuple[int, int]]:
-    """Yield rows and columns of allowed pixels at random, farther apart than given; n at most."""
-    y, x = np.nonzero(allowed)
-    taken: list[tuple[int, int]] = []
-    for _ in range(TRIES * n):
-        if len(taken) == n or not len(y):
-            return
-        i = int(rng.integers(len(y)))
-        place = int(y[i]), int(x[i])
-        if all(np.hypot(place[0] - a, place[1] - b) > apart for a, b in taken):
-            taken.append(place)
-            yield place

@@ -14,13 +14,7 @@ from functools import cached_property
 
 import numpy as np
 
-from lnocl.core.runs.guarded_runs import (
-    FIRST_ERROR,
-    GUARD,
-    GuardedRuns,
-    Judged,
-    estimate_scatter,
-)
+from lnocl.core.runs.guarded_runs import FIRST_ERROR, GUARD, GuardedRuns, Judged, estimate_scatter
 from lnocl.core.runs.outcome import Mended, PsfRefinement
 from lnocl.core.runs.psf_allowance import STRENGTH, Allowance
 from lnocl.core.runs.psf_posterior import HELD

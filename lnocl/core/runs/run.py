@@ -74,11 +74,7 @@ class Run:
     """
 
     def __init__(
-        self,
-        start: Start,
-        n_iter: int,
-        tolerance: float = 0.0,
-        engine: Engine | None = None,
+        self, start: Start, n_iter: int, tolerance: float = 0.0, engine: Engine | None = None
     ) -> None:
         self._setup, self.n_iter, self.tolerance = start.setup, n_iter, tolerance
         part = copy(start.scene), start.scaling

@@ -68,8 +68,8 @@ class Companion(NamedTuple):
 
     place: Array
     flux: float
-    errors: Array
-    significance: float
+    errors: Array = np.zeros(3)
+    significance: float = 0.0
 
 
 def companions(
@@ -91,21 +91,22 @@ def companions(
     least : float
         How significant a point must be.
     """
-    beside = estimate = _doubted(estimate)
-    scene, found = estimate.scene, list[Companion]()
+    now = beside = estimate = _doubted(estimate)
+    scene, found, points = estimate.scene, list[Companion](), list[Companion]()
     width = Surroundings(estimate, False).width
     if width < NARROWEST:  # samples do not hold its shape
         return beside, found
     stars = brightest(estimate)
-    while stars and len(found) < MOST_POINTS:
-        around = Surroundings(beside, False, raised)
+    while stars and len(points) < MOST_POINTS:
+        around = Surroundings(now, False, raised)
         likeliest = max((_likeliest(around, star) for star in stars), key=lambda each: each[-1])
         if likeliest.significance <= max(least, SIGNIFICANT):
             break
-        tried = _with_points(estimate, [*found, likeliest], width, raised)
-        if tried is None:
-            break
-        beside, found = tried
+        points = [*points, likeliest]
+        if tried := _with_points(estimate, points, width, raised):
+            now, points = beside, found = tried
+        else:  # beside another, not found yet, it may be clear
+            now = holding(estimate, points, width)
     for point in likely:
         away = [np.hypot(*(point.place - each.place)) for each in found]
         is_new = all(np.array(away) * scene.oversample > NEAREST * width)
@@ -114,11 +115,14 @@ def companions(
     return beside, found
 
 
-def errors_beside(estimate: Estimate, raised: Array | None = None) -> Array:
+def errors_beside(
+    estimate: Estimate, raised: Array | None = None, is_meant: Mask | bool = True
+) -> Array:
     """Return the standard errors of points beside the brightest stars, beside all PSFs' errors.
 
-    They are medians at distances from a star, electrons, of the shape of the sky on its grid; 0
-    where no point is looked for.
+    They are those where points are tried, and where they are fitted with their places and have to
+    stand against the extended source: typical ones of each distance from a star, electrons, of
+    shape (2, Ny, Nx) on the grid of the sky; 0 far off, and NaN where a point is part of a star.
 
     Parameters
     ----------
@@ -126,24 +130,39 @@ def errors_beside(estimate: Estimate, raised: Array | None = None) -> Array:
         That of a run with the stars that are known.
     raised : ndarray of float64, shape (n_shapes,), optional
         As of `companions`.
+    is_meant : ndarray of bool, shape (n_stars,), or bool, optional
+        Which stars have points beside them.
     """
     estimate = _doubted(estimate)
-    scene, errors = estimate.scene, np.zeros(estimate.scene.grid)
+    scene, errors = estimate.scene, np.zeros((2, *estimate.scene.grid))
     around = Surroundings(estimate, False, raised)
     if around.width < NARROWEST:
         return errors
-    for star in brightest(estimate):
+    for star in brightest(estimate, is_meant):
         near = NearStar(around, star, FINISHED)
         distance, is_tried = _places(around, near, star)
-        at = np.nonzero(is_tried)
-        found = _points(near, estimate, at)[1]
-        ring = np.round(STEPS * distance[at])
-        rings = np.unique(ring)
-        medians = [np.median(found[ring == k]) for k in rings]
-        is_near = (distance > NEAREST) & (distance <= FARTHEST)
-        profile = np.interp(STEPS * distance, rings, medians) if len(rings) else 0.0 * distance
-        there = near.places(scene)
-        errors[there] = np.maximum(errors[there], np.where(is_near, profile, 0.0) * scene.unit)
+        y, x = np.nonzero(is_tried)
+        found, profile = _points(near, estimate, (y, x))[1], []
+        rows, columns = offsets_from(scene, star, near.window)
+        rings = np.round(STEPS * distance[y, x])
+        for k in np.unique(rings):
+            ring = np.flatnonzero(rings == k)
+            i = ring[np.argsort(found[ring])[len(ring) // 2]]
+            place = scene.stars[star] + np.array([columns[x[i]], rows[y[i], 0]]) / scene.oversample
+            point = Companion(place, SIGNIFICANT * found[i] * scene.unit)
+            beside = Surroundings(holding(estimate, [point], around.width), True, raised)
+            fitted = NearStar(beside, scene.n_stars, FINISHED)
+            error = step_of(fitted, scene.n_stars, scene.n_epochs)[1]
+            if np.isfinite(error):
+                profile.append((distance[y[i], x[i]], found[i], error))
+        if profile:
+            at, *logs = np.log(sorted(profile)).T
+            between = np.log(np.maximum(distance, NEAREST))
+            values = [np.exp(np.interp(between, at, each)) * scene.unit for each in logs]
+            for each, value in zip(errors, values, strict=True):
+                value = np.where(distance > FARTHEST, 0.0, value)
+                value[distance <= NEAREST] = np.nan
+                each[near.places(scene)] = np.maximum(each[near.places(scene)], value)
     return errors
 
 

@@ -65,10 +65,7 @@ class _Joint:
     """
 
     def __init__(
-        self,
-        estimate: Estimate,
-        model: Model,
-        is_lit: NDArray[np.bool_] | None = None,
+        self, estimate: Estimate, model: Model, is_lit: NDArray[np.bool_] | None = None
     ) -> None:
         scene, extended = estimate.scene, estimate.extended
         models, views = list(estimate.models()), [View(scene, j) for j in range(scene.n_images)]

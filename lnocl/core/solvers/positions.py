@@ -86,12 +86,7 @@ class StarFit:
     """
 
     def __init__(
-        self,
-        scene: Scene,
-        model: Model,
-        extended: Array,
-        given: Array,
-        halos: Array | None = None,
+        self, scene: Scene, model: Model, extended: Array, given: Array, halos: Array | None = None
     ) -> None:
         self._given, self._observation = given, scene.observation
         n_images, turns = scene.n_images, scene.observation.turns
