@@ -21,6 +21,7 @@ import parts
 from sgp import random_scene
 
 import lnocl
+from lnocl.errors import DivergedError
 
 SIZE = 128
 LEVEL = 30.0
@@ -84,6 +85,7 @@ def try_it(image, psf, stars, device=None, **known):
     words = {
         "pixels off its centre": "centre", "does not fit": "width", "pixels from there": "place",
         "negative and were kept": "negative", "too near the end": "length",
+        "negative and were set to 0": "negative image", "may exchange light": "exchange",
         "light lies all round": "halo", "no light is left": "dark", "far less than noise": "noise",
         "not that of its counts": "noise",
         "the PSFs do not fit the stars": "error left",
@@ -178,10 +180,11 @@ def draw_images(device, path):
             try:
                 known = {"background": LEVEL, "psf_centre": centre}
                 observation = lnocl.Observation(image, wrong[name], **known)
-            except lnocl.InputError:
-                axis.set_title(f"{name}, {way}: refused", fontsize=9)
+                result = deconvolve(observation, [STAR], device=device, **settings)
+            except (lnocl.InputError, DivergedError) as error:
+                end = "refused" if isinstance(error, lnocl.InputError) else "diverges"
+                axis.set_title(f"{name}, {way}: {end}", fontsize=9)
                 continue
-            result = deconvolve(observation, [STAR], device=device, **settings)
             (found,) = result.star_residuals()
             axis.imshow(result.extended, **shown)
             axis.set_title(

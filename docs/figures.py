@@ -106,11 +106,6 @@ RECIPES = {
         "python benchmarks/wrong.py images --output $OUT/psf_wrong",
         same("validation", "psf_wrong"),
     ),
-    "psf_refined": Recipe(
-        "5 s",
-        "python benchmarks/psfs.py --output benchmarks/results/psfs --draw $OUT/psf_refined.png",
-        same("validation", "psf_refined"),
-    ),
     **{
         name: Recipe(
             "1 min", f"sh examples/real/{name}.sh $DATA $OUT", same("validation", name, "real_")

@@ -170,7 +170,7 @@ def sharp_sources(sky: Array, background: float, finer: int = 1) -> Array:
 
     It is a maximum whose 3 x 3 pixels hold nine tenths of the light that 9 x 9 pixels have above
     the level between them, and 50 standard deviations of counts. A star that was not named is such
-    a source: it has 230 standard deviations or more where all else has 13 (docs/validation/psf.md).
+    a source: it has 230 standard deviations or more where all else has 13.
 
     Parameters
     ----------

@@ -16,8 +16,7 @@ from lnocl.core.scene.scene import Scene
 from lnocl.process import ignored_warnings
 
 # The weight of the edge-preserving term near stars, in standard deviations of the gradient of the
-# data term by the error of the PSFs. More flattens the hosts of stars, less leaves halos
-# (docs/validation/psf.md).
+# data term by the error of the PSFs. More flattens the hosts of stars, less leaves halos.
 STRENGTH = 2.0
 # Where PSFs give so little of their peak, nothing is known of them.
 DARK = 1e-9

@@ -21,7 +21,7 @@ REACH, LEAST_REACH, MOST_REACH, LEVEL_FROM = 3.0, 5, 40, 2.0
 # Stars are looked at whose peak is so many times its noise, and so many times the level round them.
 MIN_SIGNIFICANCE, MIN_CONTRAST = 50.0, 3.0
 # On 100 scenes of a jet at its star, 0.3 to 300 times as bright, stars were up to 4 % wider than
-# their PSFs, and up to 0.95 FWHM over their contrast off (docs/validation/psf.md).
+# their PSFs, and up to 0.95 FWHM over their contrast off.
 MAX_WIDTH_ERROR = 0.1
 MAX_OFFSET, LIGHT_ROUND = 0.15, 1.5
 
