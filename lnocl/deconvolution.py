@@ -78,7 +78,7 @@ def deconvolve(
     star 1 (11, 12)  99 700 +- 320 electrons
     ...
 
-    `result.extended` is the image of the rest. Leave `engine` out to use an OpenCL device, and
+    ``result.extended`` is the image of the rest. Leave `engine` out to use an OpenCL device, and
     `psf_error` for PSFs that are not exact.
 
     Parameters
