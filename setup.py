@@ -1,8 +1,9 @@
-"""What setup.cfg cannot say: the kernels go into the package, and README onto its page."""
+"""What setup.cfg cannot say: kernels in the package, README and addresses on its page."""
 
 import os
 import re
 import tempfile
+from configparser import ConfigParser
 from glob import glob
 from pathlib import Path
 
@@ -29,11 +30,24 @@ def read_description() -> str:
     return re.sub(r"\[([^]]*)\]\((?!https?:)[^)]*\)", r"\1", text)
 
 
+def read_addresses() -> dict[str, str]:
+    """Return the addresses that follow from that of the repository."""
+    setup_cfg = ConfigParser()
+    setup_cfg.read("setup.cfg", encoding="utf-8")
+    repository = setup_cfg["metadata"]["url"]
+    return {
+        "Documentation": f"{repository}/tree/main/docs",
+        "Changelog": f"{repository}/blob/main/CHANGELOG.md",
+        "Issues": f"{repository}/issues",
+    }
+
+
 with tempfile.TemporaryDirectory() as folder:
     # A clone that cannot be written to is built elsewhere.
     elsewhere = {"egg_info": {"egg_base": folder}, "build": {"build_base": folder}}
     setup(
         cmdclass={"build_py": BuildWithKernels},
         long_description=read_description(),
+        project_urls=read_addresses(),
         options={} if os.access(".", os.W_OK) else elsewhere,
     )

@@ -1,8 +1,10 @@
 """Settings of Sphinx: ``sphinx-build -n -W docs build/site``."""
 
 import pydoc
+from configparser import ConfigParser
 from importlib.metadata import version as version_of
 from importlib.resources import files
+from pathlib import Path
 
 from docutils import nodes
 from docutils.utils.math.latex2mathml import tex2mathml
@@ -11,6 +13,8 @@ project = "lnocl"
 author = "The lnocl developers"
 copyright = "2026, The lnocl developers"
 release = version = version_of("lnocl")
+setup_cfg = ConfigParser()
+setup_cfg.read(Path(__file__).parents[1] / "setup.cfg", encoding="utf-8")
 
 extensions = [
     "myst_parser",
@@ -32,7 +36,10 @@ suppress_warnings = ["myst.domains"]
 smartquotes = False
 
 myst_enable_extensions = ["colon_fence", "deflist", "dollarmath", "substitution"]
-myst_substitutions = {"version": version}
+myst_substitutions = {
+    "version": version,
+    "repository": f"[the repository]({setup_cfg['metadata']['url']})",
+}
 myst_heading_anchors = 4
 
 default_role = "py:obj"

@@ -41,7 +41,11 @@ def same(folder: str, names: str, prefix: str = "") -> dict[str, str]:
 
 
 RECIPES = {
-    "demo": Recipe("1 min", "lnocl demo -o $OUT/demo", {"demo.png": "demo/demo.png"}),
+    "demo": Recipe(
+        "1 min",
+        "lnocl demo -o $OUT/demo && python docs/demo.py $OUT/demo $OUT/demo.png",
+        {"demo.png": "demo.png"},
+    ),
     "first": Recipe("5 s", "python docs/first.py $OUT/first.png", same("start", "first")),
     "symptoms": Recipe(
         "30 s",

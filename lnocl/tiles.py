@@ -303,8 +303,7 @@ def for_the_whole(observation: Observation) -> str | None:
 def _choose(tiles: Sequence[Tile], parallel: Parallel, prepared: Prepared) -> Result:
     """Return the result in the middle of those of the tiles with the brightest extended source.
 
-    One tile alone may be misled: of 1024 x 1024 fields, single tiles chose 5 to 136 iterations
-    where 8 was best (docs/validation/tiles.md).
+    One tile alone may be misled (docs/validation/tiles.md).
     """
     brightest = sorted(tiles, key=_light)[-N_CHOOSING:]
     with closing(work(partial(partial, _choice, prepared), brightest, parallel)) as answers:

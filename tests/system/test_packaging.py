@@ -198,6 +198,25 @@ def test_the_citation_has_the_version():
     assert headings[0] == "Unreleased" or headings[0].startswith(version)
 
 
+def test_addresses_are_of_one_repository(built):
+    url = re.search(r"^url = (\S+)$", (ROOT / "setup.cfg").read_text(), re.M)[1]
+    assert f"\nrepository-code: {url}\n" in (ROOT / "CITATION.cff").read_text()
+    recipe = (ROOT / "docs/developing/recipe.yaml").read_text()
+    assert f"  repository: {url}\n" in recipe
+    urls = metadata(built).project_urls
+    assert set(urls) == {"Documentation", "Changelog", "Issues"}
+    assert all(address.startswith(f"{url}/") for address in urls.values())
+
+
+def test_the_recipe_of_conda_forge_requires_what_the_wheel_does(built):
+    recipe = (ROOT / "docs/developing/recipe.yaml").read_text()
+    block = re.search(r"^  run:\n((?:    .*\n)+)", recipe, re.M)[1]
+    required = {str(one) for one in metadata(built).requires_dist if one.marker is None}
+    assert f"python {metadata(built).requires_python}" in block.replace("${{ python_min }}", "3.11")
+    listed = set(re.findall(r"- (\S+) (>=\S+)", block)) - {("python", ">=${{")}
+    assert {name + least for name, least in listed} == required
+
+
 def test_no_advice_names_a_package_that_no_index_has():
     names = tracked("*.py", "*.md", "*.sh", "*.ipynb", ".ci")
     texts = {name: (ROOT / name).read_text() for name in names}
