@@ -174,6 +174,7 @@ def test_widths_and_probabilities_may_be_quantities():
     found = result.significance(3 * u.pix, 1 * u.percent)
     assert (found.width, found.false_alarms) == (3.0, 0.01)
     np.testing.assert_array_equal(found.limit(50 * u.percent), found.limit(0.5))
-    assert found.contrast_curves([50, 90] * u.percent).colnames[3::3] == ["flux50", "flux90"]
+    names = found.contrast_curves([50, 90] * u.percent).colnames
+    assert [name for name in names if name.startswith("flux")] == ["flux50", "flux90"]
     with pytest.raises(lnocl.InputError, match="width must be in pixels, not in arcsec"):
         result.significance(3 * u.arcsec)
