@@ -5,7 +5,7 @@ from contextlib import nullcontext
 import numpy as np
 import pytest
 
-from lnocl.core.scene.blemishes import flat_tops, sharp_pixels
+from lnocl.core.scene.blemishes import cosmic_rays, flat_tops, sharp_pixels
 
 pytest.importorskip("photutils", reason="photutils is not installed")
 from lnocl.detection import find_stars
@@ -50,6 +50,21 @@ def test_stars_are_found_among_cosmic_rays_and_nothing_else(width, is_given):
     assert np.abs(found - PLACES).max() < 0.3
     assert np.isfinite(stars["width"]).all()
     assert len(RAYS) <= stars.meta["n_sharp"] <= len(RAYS) + 3
+
+
+def test_rays_in_the_wings_of_a_saturated_star_are_found():
+    """Its PSF is of a frame, with noise that is no ring of it."""
+    rng, shape = np.random.default_rng(1), (80, 80)
+    psf = lopsided(30, 30, 4.0, (61, 61)) + rng.normal(0.0, 3e-5, (61, 61))
+    light = 100.0 + 5e6 * lopsided(40.2, 39.7, 4.0, shape)
+    counts = np.minimum(rng.poisson(light), 60_000).astype(float)
+    rays = (np.array([20, 60, 41]), np.array([40, 52, 63]))
+    counts[rays] += 3000.0
+    core = counts == 60_000
+    found = cosmic_rays(np.where(core, 0.0, counts - 100.0), np.sqrt(light), core, [psf])
+    assert core.sum() > 20
+    assert found[rays].all()
+    assert found.sum() <= 9 * len(rays[0])
 
 
 @pytest.mark.exhaustive

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from itertools import product
 from typing import Any
@@ -23,8 +24,8 @@ SHARE, CLEAR = 0.3, 4.0
 # The charge of a cosmic ray spreads to those beside it that are above the sky by so many.
 SPREAD = 2.0
 # A core is what is connected to a PSF's peak above this share of it; light beyond it that may be as
-# much as this share of a sharp pixel makes that. So many adjoining bad pixels may hide a source, so
-# many times as bright as all others.
+# much as this share of a sharp pixel makes that. So many adjoining bad pixels may hide a source, at
+# most so many times as bright as what lies beside them.
 CORE, RING, HIDING, HIDDEN = 0.1, 0.5, 5, 1e3
 # Where in its pixel a star may lie, along each axis.
 PLACES = (-0.5, -0.25, 0.0, 0.25, 0.5)
@@ -101,8 +102,9 @@ def cosmic_rays(light: Array, noise: Array, bad: Mask, psfs: Sequence[Array]) ->
     """Return where an image is sharper than its PSF, as `sharp_pixels`, and is no ring of a star.
 
     A pixel is left out where something brighter, farther from it than the core of a PSF, may shed
-    half its light there; of what large groups of bad pixels hide that is always taken. The PSFs may
-    be narrower than those given, by about 0.7, as the squares of the shares are.
+    half its light there. A large group of bad pixels is taken to hide a star that the brightest
+    pixel beside it is the wing of. The PSFs may be narrower than those given, by about 0.7, as the
+    squares of the shares are.
 
     Parameters
     ----------
@@ -110,14 +112,18 @@ def cosmic_rays(light: Array, noise: Array, bad: Mask, psfs: Sequence[Array]) ->
         As for `sharp_pixels`; PSFs are of one shape. The image may be of whole counts.
     """
     holes, _ = ndimage.label(bad, np.ones((3, 3)))
-    is_hidden = (np.bincount(holes.ravel()) >= HIDING)[holes] & bad
+    n_pixels = np.bincount(holes.ravel())
+    hiding = 1 + np.flatnonzero(n_pixels[1:] >= HIDING)
+    beside = ndimage.maximum_filter(holes, 3)  # of each hole, and the pixels beside it
+    rises = [_rise(psfs, math.sqrt(n / math.pi)) for n in n_pixels[hiding]]
     lobes = np.max([_lobes(psf, max(light.shape)) for psf in psfs], axis=0)
     half = lobes.shape[0] // 2
 
     def is_shed(new: Mask) -> Mask:
         """Return which of new sharp pixels may be light of something brighter."""
         sources = np.where(new | bad, 0.0, light.clip(0.0))
-        sources[is_hidden] = HIDDEN * sources.max()
+        for k, rise in zip(hiding, rises, strict=True):
+            sources[holes == k] = rise * sources[beside == k].max()
         padded, shed = np.pad(sources, half), np.zeros(bad.shape, bool)
         for y, x in np.argwhere(new):
             there = padded[y : y + 2 * half + 1, x : x + 2 * half + 1]
@@ -126,6 +132,15 @@ def cosmic_rays(light: Array, noise: Array, bad: Mask, psfs: Sequence[Array]) ->
 
     shares = np.min([_least_shares(psf) for psf in psfs], axis=0) ** 2 / 2.0
     return _sharp(light, noise, bad, shares, True, is_shed)
+
+
+def _rise(psfs: Sequence[Array], radius: float) -> float:
+    """Return how many times as bright as light at a radius a star may be in its middle."""
+    least = 1.0
+    for psf in psfs:
+        y, x = np.indices(psf.shape) - np.reshape(np.array(psf.shape) // 2, (2, 1, 1))
+        least = min(least, float(psf[np.hypot(y, x) <= radius + 1.0].min() / psf.max()))
+    return 1.0 / max(least, 1.0 / HIDDEN)
 
 
 def _lobes(psf: Array, most: int) -> Array:
