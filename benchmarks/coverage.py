@@ -14,7 +14,6 @@ observation is a row of numbers in FOLDER; --report makes a table and the histog
 import argparse
 import re
 import warnings
-from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
@@ -22,10 +21,10 @@ import numpy as np
 from astropy import units as u
 from astropy.table import Table
 from regions import CirclePixelRegion, PixCoord, RectanglePixelRegion
+from scipy import stats
 from scipy.special import expit
 
 import lnocl
-from lnocl.core.runs.bootstrap import Bootstrap, Quantity
 from lnocl.core.scene.shifting import place
 from lnocl.io.regions import read_apertures
 from lnocl.plotting.figure import new_figure, save_figure
@@ -168,7 +167,7 @@ def measure(name, seed, n):
             "value": found.values,
             "schur": schur,
             "errors": found.errors.T,
-            "smooth": found.of_smoothing,
+            "error": found.standard_errors,
             "n_iter": np.full(len(kinds), result.n_iter),
         }
     )
@@ -176,24 +175,20 @@ def measure(name, seed, n):
 
 def score(rows):
     """Return how often the intervals of these rows hold the truth, and the ranks of the truth."""
-    quantities = tuple(Quantity("", "flux", value) for value in rows["value"])
-    found = Bootstrap(quantities, rows["errors"].T, np.zeros(0), np.zeros((2, 1, 1)), 1.0, 0)
-    found = replace(found, of_smoothing=rows["smooth"])
-    holds = []
-    for level in (0.68, 0.95):
-        low, high = found.interval(level)
-        holds.append(((low <= rows["truth"]) & (rows["truth"] <= high)).mean())
-    z = (found.values - found.bias - rows["truth"]) / found.standard_errors
+    n = rows["errors"].shape[1]
+    z = (rows["value"] - rows["errors"].mean(axis=1) - rows["truth"]) / rows["error"]
+    widths = stats.t.ppf((1.0 + np.array([0.68, 0.95])) / 2.0, n - 1) * np.sqrt(1.0 + 1.0 / n)
+    holds = [(abs(z) <= width).mean() for width in widths]
     of_star = abs(rows["value"] - rows["truth"]) / rows["schur"]
     is_star = np.isfinite(of_star).all()
     holds += [(of_star <= width).mean() if is_star else np.nan for width in (0.994, 1.96)]
     ranks = (rows["value"][:, None] - rows["errors"] < rows["truth"][:, None]).sum(axis=1)
-    return [*holds, np.sqrt(np.median(z**2) / 0.455)], (ranks + 0.5) / (found.n + 1)
+    return [*holds, np.sqrt(np.median(z**2) / 0.455)], (ranks + 0.5) / (n + 1)
 
 
 def pick(tables, pattern):
     """Return the rows of all tables whose quantity has such a name, as arrays."""
-    columns = {name: [] for name in ("truth", "value", "schur", "errors", "smooth")}
+    columns = {name: [] for name in ("truth", "value", "schur", "errors", "error")}
     for table in tables:
         rows = table[[re.match(pattern, str(name)) is not None for name in table["quantity"]]]
         for name, values in columns.items():
