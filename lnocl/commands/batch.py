@@ -413,4 +413,5 @@ COMMAND = Command(
     "deconvolve many targets, each a row of a table, and sum up what became of them",
     {"": OPTIONS},
     _run,
+    goes_on=": the same command goes on with the targets that are left",
 )

@@ -258,4 +258,5 @@ COMMAND = Command(
     "add errors of stars, regions and pixels to a result, by replicas of its run",
     {"": OPTIONS},
     _run,
+    goes_on=": the same command goes on from the replicas that were written",
 )

@@ -29,12 +29,15 @@ class Command(NamedTuple):
         Runs it with the parsed arguments, and yields the lines that it says.
     epilog : str
         The last paragraph of its help.
+    goes_on : str
+        What is added to the word that it was interrupted.
     """
 
     summary: str
     options: Options
     run: Callable[[argparse.Namespace], Iterable[str]]
     epilog: str = ""
+    goes_on: str = ""
 
     def carry_out(self, arguments: argparse.Namespace) -> Iterator[str]:
         """Run it, and yield the lines that it says, and show notes, unless it is to be quiet.

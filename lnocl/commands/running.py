@@ -33,12 +33,14 @@ def run(commands: Mapping[str, Command], words: Sequence[str]) -> int:
         The command line without the program's name.
     """
     flags: dict[str, str] = {}
+    goes_on = ""
     try:
         with first_handled(ENDING, terminate), warnings.catch_warnings():
             warnings.simplefilter("always", LnoclWarning)
             warnings.showwarning = partial(messages.show_warning, flags)
             parsed = make_parser(commands).parse_args(words)
             flags |= parsed.command.flags()
+            goes_on = parsed.command.goes_on
             parsed.command.refuse_ignored(parsed)
             with (
                 kept(parsed.command.inputs(parsed)),
@@ -52,9 +54,9 @@ def run(commands: Mapping[str, Command], words: Sequence[str]) -> int:
             raise
         return messages.fail("not enough memory; cut the images, or give fewer at a time", FAILED)
     except Terminated as error:
-        return messages.fail("terminated", 128 + error.args[0])
+        return messages.fail(f"terminated{goes_on}", 128 + error.args[0])
     except KeyboardInterrupt:
-        return messages.fail("interrupted", INTERRUPTED)
+        return messages.fail(f"interrupted{goes_on}", INTERRUPTED)
     except OSError as error:
         return messages.fail(str(error), FAILED)
     return 0

@@ -311,7 +311,9 @@ def test_an_interrupt_ends_it_and_the_next_call_goes_on():
             time.sleep(0.01)
         time.sleep(0.5)  # it listens from the first iteration on
         process.send_signal(signal.SIGINT)
-        assert process.stderr.read().splitlines()[-1] == "lnocl: error: interrupted"
+        assert process.stderr.read().splitlines()[-1] == (
+            "lnocl: error: interrupted: the same command goes on with the targets that are left"
+        )
     assert process.returncode == 130
     assert json.loads(Path("out/long.json").read_text())["status"] == "started"
     assert [each["status"] for each in summary().values()] == ["done", "started", "waiting"]
