@@ -20,11 +20,13 @@ from scipy.signal import fftconvolve
 from lnocl.core.scene.arrays import Array
 from lnocl.core.scene.detector import psfs_on_detector
 from lnocl.core.scene.observation import Observation
+from lnocl.core.scene.transforms import enlarged, part
 
-# Images are sought so many pixels round their places; less than the other is left to the fit of
-# PSFs, which tells it better.
-REACH, LEAST = 30, 0.75
-SIDE = 2 * REACH + 1
+# Images are sought so many pixels round the places of their brightest stars; less than the other is
+# left to the fit of PSFs, which tells it better.
+REACH, LEAST, MOST_STARS = 30, 0.75, 20
+# The side of what is looked at round a star, and of a PSF; pixels beside that for interpolation.
+SIDE, BESIDE = 2 * REACH + 1, 3
 # A maximum is no side lobe where it is so many times as high as one. It is that of stars where it
 # is this share of the highest, or so many times the share that they have in the first image; the
 # highest is so many times its noise.
@@ -48,7 +50,8 @@ def displacements(observation: Observation, stars: Array) -> Array:
     stars : ndarray of float64, shape (n, 2)
         Places of stars on the sky, pixels.
     """
-    psfs, moved = psfs_on_detector(observation), np.zeros((observation.n_images, 2))
+    psfs, moved = _middles(observation), np.zeros((observation.n_images, 2))
+    stars = _brightest(observation, stars)
     first, share = _found(observation, 0, stars, psfs[0], moved[0], SHARE / ALIKE)
     of_stars = np.linalg.solve(observation.turns[0], first)
     for j in range(1, len(psfs) if np.isfinite(of_stars).all() else 0):
@@ -65,11 +68,12 @@ def _found(
 
     That is of the highest maximum, and is not much less than that which is given.
     """
-    total, width = _total(_significance(observation, j, psf), observation.places(j, stars)), SIDE
+    total, width = _total(observation, j, psf, observation.places(j, stars)), SIDE
     y, x = np.indices(total.shape) - REACH
     highest = row, column = divmod(int(np.argmax(total)), width)
     rows, columns = (slice(width - 1 - i, 2 * width - 1 - i) for i in (row, column))
-    lobe = total[highest] * _lobes(psf, width)[rows, columns]
+    lobes = fftconvolve(psf, psf[::-1, ::-1]) / (psf**2).sum()
+    lobe = total[highest] * lobes[rows, columns]
     peaks = (total == maximum_filter(total, 3)) & (total > APART * lobe)
     away = np.hypot(y - expected[1], x - expected[0])
     peaks &= total > np.where(away < NEAR, LEAST_SHARE, ALIKE * share) * total[highest]
@@ -88,46 +92,50 @@ def _found(
 
 def turned_otherwise(observation: Observation, stars: Array) -> list[int]:
     """Return images whose stars lie as if they were turned by as much the other way."""
-    found = []
-    for j, psf in enumerate(psfs_on_detector(observation)):
+    found, stars = list[int](), _brightest(observation, stars)
+    for j, psf in enumerate(_middles(observation)):
         places, turn = observation.places(j, stars), observation.turns[j]
         if len(stars) > 1 and (turn != turn.T).any():
-            light = _significance(observation, j, psf)
             others = places.mean(axis=0) + (stars - stars.mean(axis=0)) @ turn
-            lies, would_lie = (_total(light, each).max() for each in (places, others))
+            both = places, others
+            lies, would_lie = (_total(observation, j, psf, each).max() for each in both)
             if would_lie > max(CLEARLY * lies, SIGNIFICANT):
                 found.append(j)
     return found
 
 
-def _total(light: Array, places: Array) -> Array:
-    """Return the root of the sum of squares of C at the places of stars, for each move."""
-    y, x = np.indices((SIDE, SIDE)) - REACH
-    return np.sqrt(sum(map_coordinates(light, [y + at_y, x + at_x]) ** 2 for at_x, at_y in places))
+def _total(observation: Observation, j: int, psf: Array, places: Array) -> Array:
+    """Return the root of the sum of squares of C over its noise, for each move of all places."""
+    image, mask = observation.images[j], observation.mask[j]
+    background = np.broadcast_to(observation.background[j], image.shape)
+    noise = np.sqrt(max(float(np.median(image[~mask])), 1.0))
+    half = 2 * REACH + BESIDE
+    y, x = np.indices((SIDE, SIDE)) + BESIDE
+    total, seen = np.zeros((SIDE, SIDE)), psf[::-1, ::-1]
+    for at_x, at_y in places.tolist():
+        row, column = round(at_y), round(at_x)
+        rows, columns = (range(at - half, at + half + 1) for at in (row, column))
+        good = part(~mask, rows, columns) * 1.0
+        above = part(image, rows, columns) - part(background, rows, columns)
+        light = fftconvolve(good * above, seen, "valid")
+        squares = fftconvolve(good, seen**2, "valid").clip(min=(psf**2).sum() / 4.0)
+        significance = light.clip(min=0.0) / (noise * np.sqrt(squares))
+        total += map_coordinates(significance, [y + at_y - row, x + at_x - column]) ** 2
+    return np.sqrt(total)
 
 
-def _significance(observation: Observation, j: int, psf: Array) -> Array:
-    """Return C of an image over its noise, 0 where that is negative."""
-    good = (~observation.mask[j]).astype(np.float64)
-    background = np.broadcast_to(observation.background[j], good.shape)
-    light = good * (observation.images[j] - background)
-    noise = np.sqrt(max(float(np.median(observation.images[j][good > 0])), 1.0))
-    psf = np.pad(psf, [(0, 1 - n % 2) for n in psf.shape])[::-1, ::-1]
-    squares = fftconvolve(good, psf**2, "same").clip(min=(psf**2).sum() / 4.0)
-    return np.asarray(fftconvolve(light, psf, "same").clip(min=0.0) / (noise * np.sqrt(squares)))
+def _middles(observation: Observation) -> list[Array]:
+    """Return the middle of the PSF of each image, of odd sides."""
+    return [enlarged(psf, (SIDE, SIDE), is_centred=True) for psf in psfs_on_detector(observation)]
 
 
-def _lobes(psf: Array, width: int) -> Array:
-    """Return the correlation of a PSF with itself, 1 in the middle, (2 width - 1, 2 width - 1)."""
-    own = fftconvolve(psf, psf[::-1, ::-1]) / (psf**2).sum()
-    lobes = np.zeros((2 * width - 1,) * 2)
-    halves = [(n // 2, width - 1) for n in own.shape]
-    of_own, of_all = (
-        tuple(slice(pair[k] - min(pair), pair[k] + min(pair) + 1) for pair in halves)
-        for k in (0, 1)
-    )
-    lobes[of_all] = own[of_own]
-    return lobes
+def _brightest(observation: Observation, stars: Array) -> Array:
+    """Return the stars of which the first image has most light, `MOST_STARS` of them."""
+    columns, rows = np.round(observation.places(0, stars)).astype(int).T
+    image = observation.images[0]
+    inside = (rows >= 0) & (rows < image.shape[0]) & (columns >= 0) & (columns < image.shape[1])
+    light = np.where(inside, image[rows * inside, columns * inside], 0.0)
+    return stars[np.argsort(-light, kind="stable")[:MOST_STARS]]
 
 
 def _vertex(before: float, middle: float, after: float) -> float:
