@@ -57,7 +57,7 @@ def assert_same(found, expected):
 
 @pytest.mark.filterwarnings("ignore::lnocl.LnoclWarning")
 @pytest.mark.parametrize(("solver", "kind", "engine"), RUNS)
-def test_what_was_cut_off_ends_bit_for_bit_where_it_would_have(solver, kind, engine, tmp_path):
+def test_resumed_run_is_bit_identical_to_an_uninterrupted_run(solver, kind, engine, tmp_path):
     recipe, more = KINDS[kind]
     made, path = recipe.make(), str(tmp_path / "run.fits")
     given = {"solver": solver, "n_iter": 30, **engine, **more}
@@ -293,7 +293,7 @@ def test_nothing_truncated_or_altered_is_gone_on_from(share, saved, tmp_path):
 @pytest.mark.parametrize(
     "content", [b"", b"SIMPLE", b"\x80\x04pickle"], ids=["empty", "cut", "other"]
 )
-def test_what_is_no_checkpoint_is_refused(content, tmp_path):
+def test_invalid_checkpoint_is_refused(content, tmp_path):
     path = tmp_path / "other.fits"
     path.write_bytes(content)
     with pytest.raises(lnocl.FileError, match="is not a checkpoint, or a damaged one"):
@@ -349,7 +349,7 @@ def test_a_checkpoint_stays_in_its_folder_wherever_the_process_goes(tmp_path, mo
 
 
 @pytest.mark.parametrize("solver", ["sgm", "sgp"])
-def test_a_run_that_had_ended_is_kept_in_another_file_too(solver, tmp_path):
+def test_finished_run_is_copied_to_another_checkpoint(solver, tmp_path):
     made, first, second = STARS.make(), tmp_path / "first.fits", tmp_path / "second.fits"
     given = {"n_iter": 3, "engine": "numpy", "solver": solver}
     whole = made.deconvolve(**given, checkpoint=first)

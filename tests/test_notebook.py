@@ -69,14 +69,14 @@ def test_without_matplotlib_the_table_is_there(monkeypatch):
     assert "<td style='text-align:left'>c</td>" in page
 
 
-def test_an_observation_says_what_it_holds():
+def test_observation_repr_shows_its_shapes_exposures_and_mask():
     made = Recipe((16, 12), n_images=2, background="each", read_noise=3.0, masked=0.25).make()
     page = made.observation(exposure=[10.0, 30.0])._repr_html_()
     for words in ("2 of 12 x 16 pixels", "10 to 30", "bad pixels", "8 x 7 pixels"):
         assert words in page
 
 
-def test_a_result_says_what_it_found():
+def test_result_repr_shows_iterations_and_star_fluxes():
     made = Recipe((16, 12), n_stars=2).make()
     result = made.deconvolve(n_iter=2, engine="numpy")
     page = result._repr_html_()

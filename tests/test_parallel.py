@@ -97,13 +97,13 @@ def test_this_process_does_one_after_the_other():
 
 
 @pytest.mark.parametrize("wrong", [0, -1, 2.0, "two", None, "current scheduler"])
-def test_what_says_nothing_of_processes_is_refused(wrong):
+def test_invalid_values_of_parallel_are_refused(wrong):
     with pytest.raises(InputError, match="parallel must be True, False, a number of processes or"):
         check_parallel(wrong)
 
 
 @pytest.mark.parametrize("given", [True, 1, CURRENT])
-def test_without_dask_one_line_says_what_to_install(monkeypatch, given):
+def test_missing_dask_is_reported_with_its_install_command(monkeypatch, given):
     monkeypatch.setitem(sys.modules, "distributed", None)
     check_parallel(False)
     with pytest.raises(LnoclError, match=r"parallel needs Dask; install it with: pip install"):
@@ -135,7 +135,7 @@ def test_processes_of_its_own_end_with_the_work(monkeypatch):
 
 
 @pytest.mark.exhaustive
-def test_workers_hold_what_does_the_tasks(client):
+def test_each_worker_creates_its_task_runner_once(client):
     answers = list(work(partial(Squares, 0.2), range(20), CURRENT))
     assert [each[0] for each in answers] == [k**2 for k in range(20)]
     pids = [each[1] for each in answers]
@@ -222,7 +222,7 @@ def test_work_inside_a_task_is_refused(client, inner):
 
 @pytest.mark.exhaustive
 @pytest.mark.parametrize("is_file", [True, False])
-def test_a_script_that_processes_cannot_read_is_told(tmp_path, is_file):
+def test_script_that_workers_cannot_import_is_reported(tmp_path, is_file):
     script = "from lnocl.parallel import work\ndef make():\n    return abs\n"
     if is_file:
         (tmp_path / "script.py").write_text(f"{script}print(list(work(make, [-1], 2)))\n")

@@ -74,7 +74,7 @@ def test_few_counts_have_their_moments_too(level):
 
 
 @pytest.mark.filterwarnings("error::lnocl.errors.MisfitWarning")
-def test_a_model_of_few_counts_is_not_said_to_follow_the_noise():
+def test_fitting_model_of_few_counts_has_a_good_verdict():
     y, x = np.indices((40, 40))
     psf = np.exp(-((x[:21, :21] - 10) ** 2 + 1.4 * (y[:21, :21] - 9.7) ** 2) / 3.0)
     light = 0.02 + 3.0 * np.exp(-((x - 25) ** 2 + (y - 18) ** 2) / 30.0)

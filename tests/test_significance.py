@@ -116,14 +116,14 @@ def test_the_extended_source_may_be_a_jet_but_no_point(result, place, is_point):
         assert flux == pytest.approx(2000, rel=0.15)
 
 
-def test_a_point_of_no_flux_has_an_error_though_its_place_has_none(result):
+def test_point_of_negative_flux_has_a_finite_flux_and_error(result):
     estimate = result._outcome.estimate
     flux, error = point_flux(estimate, np.array([20.0, 40.0]), -5.0, True, np.zeros(0))
     assert np.isfinite(flux)
     assert 0 < error < np.inf
 
 
-def test_a_point_is_told_from_the_extended_source_with_shapes_of_psfs_held(result, monkeypatch):
+def test_psf_error_raises_the_error_of_a_point_without_psf_slopes(result, monkeypatch):
     exact, found = result._outcome.estimate, []
     monkeypatch.delattr(PsfErrors, "slopes")
     scene = Scene(exact.scene.observation.replace(psf_error=0.03), exact.scene.places)
@@ -233,7 +233,7 @@ def test_a_companion_does_not_limit_the_ring_that_it_lies_in():
     assert (ratio < 2.0).all()
 
 
-def test_what_is_found_does_not_limit_what_lies_beside_it(found):
+def test_detected_point_does_not_raise_limits_around_it(found):
     """As part of the sky it raised limits to 50 times within ten pixels."""
     limits, (rows, columns) = found.limit(0.5), np.indices((N, N))
     away = np.hypot(columns - 52.4, rows - 40.2)
@@ -251,7 +251,7 @@ def test_the_limit_of_a_half_is_about_the_threshold(found):
     assert (abs(snr - found.threshold) < 1.0).all()
 
 
-def test_points_near_a_star_are_five_errors_above_what_psfs_may_have_wrong(found, monkeypatch):
+def test_limits_near_a_star_are_five_psf_errors_or_more(found, monkeypatch):
     """And, fitted, three above that and what the extended source may be."""
     error, limits = np.zeros(found._map.values.shape), []
     error[20:24, 43:46] = 1e5
@@ -347,7 +347,7 @@ def test_bad_pixels_and_a_finer_sky():
         assert abs(source[axis].value - at) < 0.2
 
 
-def test_turned_images_find_what_is_in_all(result):
+def test_source_common_to_rotated_images_is_detected(result):
     angle = np.deg2rad(30.0)
     turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
     middle = np.full(2, (N - 1) / 2)
@@ -480,7 +480,7 @@ def test_the_function_is_that_of_the_method(result, found):
     np.testing.assert_array_equal(again.signal_to_noise, found.signal_to_noise)
 
 
-def test_equal_psfs_of_a_field_give_what_one_gives(result, found):
+def test_field_of_equal_psfs_gives_the_detections_of_a_single_psf(result, found):
     field = lnocl.PsfField(np.array([PSF] * 4), [(0, 0), (N, 0), (0, N), (N, N)])
     images = result._outcome.observation.images
     observation = lnocl.Observation(images, field, background=SKY)

@@ -90,7 +90,7 @@ def test_between_nodes_psfs_are_bilinear_and_beyond_them_constant():
         (np.ones((1, 3, 3)), [(0, np.nan)], "must be finite"),
     ],
 )
-def test_fields_that_are_none_are_refused(psfs, positions, message):
+def test_invalid_psf_fields_are_refused(psfs, positions, message):
     with pytest.raises(InputError, match=message):
         PsfField(psfs, positions)
 
@@ -199,7 +199,7 @@ def test_each_star_has_the_psf_of_its_own_place(solver):
 
 @pytest.mark.filterwarnings("ignore:the noise of image", "ignore:neighbouring pixels")
 @pytest.mark.filterwarnings("ignore:psf . varies")
-def test_fields_are_part_of_what_a_checkpoint_is_of(tmp_path):
+def test_checkpoint_of_other_psf_fields_is_refused(tmp_path):
     path = tmp_path / "c.fits"
     image = make_sky() + 5.0
     run = {"n_iter": 2, "smoothing": 0.0, **RUN}
@@ -413,7 +413,7 @@ def test_tiles_come_near_a_psf_for_each_pixel():
 
 
 @pytest.mark.exhaustive
-def test_all_tiles_take_what_the_brightest_chooses():
+def test_all_tiles_use_the_settings_chosen_by_the_brightest():
     observation, stars = make_frame(n_stars=4)
     run = {key: RUN[key] for key in ("engine", "precision")}
     result = lnocl.deconvolve_tiles(observation, stars, tile=96, pad=4, n_iter=60, **run)
@@ -543,7 +543,7 @@ def test_a_psf_of_one_pixel_has_margins_too():
         ({"tile": 80, "solver": "best"}, "solver 'best' is not known"),
     ],
 )
-def test_what_is_not_for_tiles_is_refused(options, message):
+def test_invalid_options_for_tiles_are_refused(options, message):
     observation, stars = make_frame()
     with pytest.raises(InputError, match=message):
         lnocl.deconvolve_tiles(observation, stars, **{"stop": None, "pad": 5, **options})
@@ -556,7 +556,7 @@ def test_tiles_have_no_replicas():
 
 
 @pytest.mark.exhaustive
-def test_what_tiles_say_is_summed_up():
+def test_warnings_of_tiles_are_limited_and_summarised():
     observation, stars = make_frame(n_stars=12)
     bad = np.zeros((N, N), bool)
     bad[*np.round(stars[:, ::-1]).astype(int).T] = True
@@ -632,7 +632,7 @@ def test_stdpsf_files_are_read(tmp_path, monkeypatch):
         (["--oversample", "2"], "give --effective-psfs"),
     ],
 )
-def test_the_shell_refuses_what_is_not_for_tiles(more, message, tmp_path, monkeypatch, capsys):
+def test_command_refuses_invalid_options_for_tiles(more, message, tmp_path, monkeypatch, capsys):
     pytest.importorskip("photutils", reason="photutils is not installed")
     monkeypatch.chdir(tmp_path)
     assert cli.main([*write_frame(*stpsf_file()), *more]) == 2

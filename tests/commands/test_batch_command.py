@@ -44,7 +44,7 @@ GOOD = ('one,a.fits,k1.fits,"7,5 3.5,2",3', 'two,a.fits b.fits,k1.fits k2.fits,"
 
 
 @pytest.mark.exhaustive
-def test_each_target_is_what_its_command_gives(capsys):
+def test_batch_results_match_the_deconvolve_command(capsys):
     write_targets(*GOOD)
     assert batch() == 0
     said = capsys.readouterr()
@@ -70,7 +70,7 @@ def test_each_target_is_what_its_command_gives(capsys):
     assert "\n3 iterations, all that were allowed; " in log
 
 
-def test_the_summary_says_what_was_found_and_whether_it_fits(capsys):
+def test_summary_gives_fluxes_errors_and_the_verdict_of_each_target(capsys):
     flat = np.random.default_rng(0).poisson(50.0, (32, 32)).astype(float)
     fits.writeto("flat.fits", flat, fits.Header({"BUNIT": "electron"}))
     write_targets("lost,gone.fits,k1.fits,,1", GOOD[0], "flat,flat.fits,k1.fits,,9")
@@ -162,7 +162,7 @@ def test_the_longest_name_of_a_file():
 
 
 @pytest.mark.exhaustive
-def test_what_is_done_is_not_done_again(capsys):
+def test_finished_targets_are_skipped_when_the_batch_is_repeated(capsys):
     write_targets("late,c.fits,k1.fits,,2", *GOOD)
     assert batch("--quiet") == 1
     before = {name: os.stat(f"out/{name}").st_mtime_ns for name in ("one.fits", "one.json")}
@@ -177,7 +177,7 @@ def test_what_is_done_is_not_done_again(capsys):
 
 
 @pytest.mark.exhaustive
-def test_what_another_command_has_made_stays(capsys):
+def test_outputs_of_other_commands_are_not_overwritten(capsys):
     write_targets(*GOOD)
     assert batch("--quiet") == 0
     made = Path("out/one.fits").read_bytes()
@@ -216,7 +216,7 @@ def test_job_arrays_share_the_targets():
         ("--parallel", ["0", "-2", "many", "1.5"], "is neither a number of processes"),
     ],
 )
-def test_parts_and_processes_that_are_none_are_refused(option, values, message, capsys):
+def test_invalid_array_parts_and_process_counts_are_refused(option, values, message, capsys):
     write_targets(*GOOD)
     for value in values:
         assert batch(option, value) == 2
@@ -287,7 +287,7 @@ def test_names_that_leave_the_folder_are_rows_that_fail():
 
 
 @pytest.mark.exhaustive
-def test_the_picture_shows_what_is_done(capsys):
+def test_batch_picture_is_drawn_and_not_overwritten(capsys):
     pytest.importorskip("matplotlib")
     from matplotlib.image import imread
 
@@ -370,7 +370,7 @@ def test_files_of_others_and_inputs_stay(capsys):
     assert json.loads(Path("q.json").read_text())["status"] == "done"
 
 
-def test_the_summary_says_what_became_of_the_rows_that_are_now():
+def test_summary_gives_the_status_of_each_row_of_the_current_table():
     write_targets("../up,a.fits,k1.fits,,1", "b,a.fits,k1.fits,,1", "c,a.fits,k1.fits,,1")
     assert batch("--quiet", "--array", "1/2") == 1
     assert batch("--quiet", "--array", "2/2") == 0
@@ -381,7 +381,7 @@ def test_the_summary_says_what_became_of_the_rows_that_are_now():
     assert [each["status"] for each in summary().values()] == ["failed", "waiting", "done"]
 
 
-def test_what_is_done_hangs_on_the_folder_that_files_are_named_from(tmp_path, monkeypatch):
+def test_outputs_are_refused_when_files_resolve_from_another_folder(tmp_path, monkeypatch):
     write_targets("t,a.fits,k1.fits,,1")
     assert batch("--quiet") == 0
     for name in ("b.fits", "k1.fits", "targets.csv"):

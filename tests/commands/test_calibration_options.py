@@ -112,7 +112,7 @@ class TestFrames:
         assert fits.getheader("out.fits")["HISTORY"] == header["HISTORY"]
 
     @pytest.mark.exhaustive
-    def test_it_is_what_the_library_makes_of_the_files(self):
+    def test_command_result_matches_the_library_result_from_the_same_files(self):
         assert self.run(*self.OPTIONS, *self.sky_option, "--quiet") == 0
         known = Calibration(
             background=["auto", "level.fits"],
@@ -226,7 +226,7 @@ class TestFrames:
         assert len(header["ESUM1"]) == len(header["RSUM1"]) == 64
 
     @pytest.mark.exhaustive
-    def test_what_was_done_is_said_unless_it_is_quiet(self, capsys):
+    def test_calibration_steps_are_printed_when_verbose_and_not_when_quiet(self, capsys):
         assert self.run(*self.OPTIONS, *self.sky_option, "--verbose") == 0
         said = capsys.readouterr()
         level = fits.getheader("out.fits")["BKG1"]

@@ -39,7 +39,7 @@ class TestDeconvolve:
             ["a.fits", "b.fits", "--psf", "k1.fits", "--psf", "k2.fits"],
         ],
     )
-    def test_the_file_holds_what_the_function_returns(self, inputs, capsys):
+    def test_result_file_matches_the_deconvolve_function(self, inputs, capsys):
         options = (*NUMPY, *self.ARGUMENTS, "--residuals", "-o", "out.fits")
         status = cli.main(["deconvolve", *inputs, *options])
         captured = capsys.readouterr()
@@ -85,7 +85,7 @@ class TestDeconvolve:
             "7 iterations, all that were allowed; out.fits",
         ]
 
-    def test_what_was_measured_and_chosen_is_said_when_asked_for(self, capsys):
+    def test_verbose_run_prints_residuals_and_objective_to_stderr(self, capsys):
         """On stderr, and always in the file."""
         assert run("--verbose") == 0
         said = capsys.readouterr().err.splitlines()
@@ -104,7 +104,7 @@ class TestDeconvolve:
         assert one_complaint(capsys.readouterr()) == complaint
 
     @pytest.mark.parametrize("background", [25.0, 50.0])
-    def test_a_background_too_low_is_said(self, capsys, background):
+    def test_background_too_low_is_reported(self, capsys, background):
         image = np.random.default_rng(0).poisson(50.0, (32, 32)).astype(float)
         fits.writeto("flat.fits", image)
         arguments = ["--background", str(background), "--n-iter", "5", "--stop", "none"]
@@ -121,7 +121,7 @@ class TestDeconvolve:
             assert 15 < darkest < 25
 
     @pytest.mark.exhaustive
-    def test_what_was_tried_is_not_advised(self, capsys):
+    def test_verdict_does_not_advise_a_refinement_already_made(self, capsys):
         inputs = ("a.fits", "b.fits", "--psf", "k1.fits", "--refine-psfs", "pixels")
         assert cli.main(["deconvolve", *inputs, *NUMPY, *self.ARGUMENTS, "-o", "out.fits"]) == 0
         lines = capsys.readouterr().out.splitlines()
@@ -158,7 +158,7 @@ class TestDeconvolve:
         )
 
     @pytest.mark.parametrize("n_iter", [1, 30])
-    def test_a_run_that_ends_at_once_is_said(self, n_iter, capsys, monkeypatch):
+    def test_run_that_ends_without_an_iteration_is_reported(self, n_iter, capsys, monkeypatch):
         """But not where one iteration was asked for."""
         if n_iter > 1:
             monkeypatch.setattr("lnocl.core.reference.decide.SUFFICIENT", 1e9)  # no step is enough
@@ -167,7 +167,7 @@ class TestDeconvolve:
         assert said == (n_iter > 1)
 
     @pytest.mark.exhaustive
-    def test_what_the_device_must_hold_is_said_first(self, capsys):
+    def test_memory_estimate_is_the_first_verbose_line(self, capsys):
         assert run("--n-iter", "1", "--verbose", engine=()) == 0
         name = re.escape(device.describe(device.choose().device))
         assert re.match(

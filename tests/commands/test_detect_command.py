@@ -33,7 +33,7 @@ def result(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("output", ["found.ecsv", "found.csv", "found.fits"])
-def test_detections_are_said_written_and_added(output, capsys):
+def test_detections_are_printed_written_and_added_to_the_result(output, capsys):
     assert cli.main(["detect", "out.fits", "-o", output]) == 0
     captured = capsys.readouterr()
     assert "warning" not in captured.err
@@ -93,7 +93,7 @@ def test_detections_replace_those_that_are_there(capsys):
 
 
 @pytest.mark.exhaustive
-def test_limits_are_said_written_added_and_checked(capsys):
+def test_limits_are_printed_written_added_and_checked_by_injections(capsys):
     words = ["limit", "out.fits", "-o", "limits.ecsv", "--injections", "11"]
     assert cli.main(words) == 0
     said = capsys.readouterr().out.splitlines()
@@ -115,12 +115,12 @@ def test_limits_are_said_written_added_and_checked(capsys):
         assert hdus["LIMIT50"].header["BUNIT"] == "electron"
 
 
-def test_no_sources_are_put_in_where_none_are_wanted(capsys):
+def test_zero_injections_inject_no_sources(capsys):
     assert cli.main(["limit", "out.fits", "--injections", "0"]) == 0
     assert "put in" not in capsys.readouterr().out
 
 
-def test_limits_are_said_at_round_distances(capsys):
+def test_limits_are_printed_at_round_distances(capsys):
     assert cli.main(["limit", "out.fits", "--injections", "0", "-o", "limits.ecsv"]) == 0
     said = capsys.readouterr().out.splitlines()
     (names, units), rows = (line.split() for line in said[1:3]), said[4:-2]
@@ -140,7 +140,7 @@ def test_limits_are_said_at_round_distances(capsys):
 
 
 @pytest.mark.exhaustive
-def test_a_limit_that_is_too_faint_is_told(capsys, monkeypatch):
+def test_limit_too_faint_for_injected_sources_is_reported(capsys, monkeypatch):
     from lnocl.significance import Significance
 
     before = Significance.limit

@@ -88,7 +88,7 @@ def test_errors_are_added_to_the_file(words, capsys):
 
 @pytest.mark.exhaustive
 @pytest.mark.usefixtures("result")
-def test_regions_are_said_before_stars_and_all_of_them(capsys, monkeypatch):
+def test_regions_are_printed_before_stars_and_in_full(capsys, monkeypatch):
     monkeypatch.setattr("lnocl.commands.errors.MAX_LISTED", 2)
     assert cli.main([*ERRORS, "10"]) == 0
     first, *lines = capsys.readouterr().out.splitlines()
@@ -220,7 +220,7 @@ def forget_the_run():
 
 @pytest.mark.exhaustive
 @pytest.mark.usefixtures("result")
-def test_no_run_is_made_again_where_the_file_has_what_it_found(monkeypatch, capsys):
+def test_run_is_repeated_only_where_the_file_lacks_its_estimate(monkeypatch, capsys):
     assert cli.main([*ERRORS, "10"]) == 0
     assert "the run is made again" not in capsys.readouterr().err
     expected = held()
@@ -304,7 +304,7 @@ def test_overwrite_begins_anew():
 
 @pytest.mark.exhaustive
 @pytest.mark.usefixtures("result")
-def test_replicas_of_another_command_meanwhile_are_kept(monkeypatch, capsys):
+def test_replicas_written_by_another_command_are_preserved(monkeypatch, capsys):
     """Of the same replicas the more are kept, and those of something else are not replaced."""
     for words, name in ((["12"], "more"), (["10", "--seed", "5"], "other")):
         assert cli.main([*ERRORS, *words, "--overwrite", "--quiet"]) == 0
@@ -361,7 +361,7 @@ def test_wrong_uses_are_one_line_and_leave_the_file(capsys):
 
 
 @pytest.mark.usefixtures("result")
-def test_what_has_changed_since_is_refused(capsys):
+def test_result_of_changed_images_is_refused(capsys):
     images = fits.getdata("images.fits")
     fits.writeto("images.fits", images[:, ::-1], overwrite=True)
     assert cli.main(["errors", "out.fits"]) == 2

@@ -106,7 +106,7 @@ def test_a_signal_that_was_ignored_stays_so():
         signal.signal(signal.SIGINT, before)
 
 
-def test_signals_do_again_what_they_did_once_the_run_is_over():
+def test_signal_handlers_are_restored_after_the_run():
     if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.default_int_handler)
     before = [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]

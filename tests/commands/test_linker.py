@@ -10,9 +10,7 @@ from lnocl.errors import DeviceError
 
 
 @pytest.mark.parametrize("command", ["demo", "selftest", "devices"])
-def test_a_linker_that_is_missing_is_said_before_anything_else(
-    command, tmp_path, monkeypatch, capsys
-):
+def test_missing_linker_is_reported_before_any_other_output(command, tmp_path, monkeypatch, capsys):
     """So that the same command works once there is one."""
 
     def check(_):

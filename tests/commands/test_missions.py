@@ -215,7 +215,7 @@ EXPECTED = {
 
 @pytest.mark.usefixtures("command_folder")
 class TestWhatIsGiven:
-    def test_goes_before_what_the_telescope_says(self):
+    def test_given_calibration_takes_precedence_over_the_telescope_header(self):
         of_wfc3_ir("ir")
         every = {"noise", "mask", "background", "exposure"}
         assert calibrate("ir.fits", {}).keys() == every
@@ -229,7 +229,7 @@ class TestWhatIsGiven:
         ]:
             assert calibrate("ir.fits", {name: value}).keys() == every - without
 
-    def test_a_rate_without_its_exposure_says_none(self, capsys):
+    def test_rate_image_without_exposure_time_is_refused(self, capsys):
         cards = {"BUNIT": "ELECTRONS/S"}
         write_plainly("ir.fits", {"TELESCOP": "HST"}, cards)
         assert calibrate("ir.fits", {}).keys() == {"read_noise", "background"}

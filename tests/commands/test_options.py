@@ -321,7 +321,7 @@ class TestDeclared:
     def test_the_help_is_the_first_paragraph_of_the_docstring(self, name, text):
         assert parameter(self.function, name).keywords["help"] == text
 
-    def test_what_the_shell_gives_takes_the_place_of_what_is_declared(self):
+    def test_shell_option_overrides_the_declared_name_and_default(self):
         made = parameter(self.function, "n", "-n", also="of tiles", dest="rounds", default=None)
         assert (made.name, made.default) == ("rounds", None)
         assert made.keywords["help"].endswith("1 or more; of tiles (default: 3)")

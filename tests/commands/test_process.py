@@ -59,7 +59,7 @@ class TestProcess:
         assert (done.returncode, without_progress(done.stderr)) == (0, "")
         assert fits.getdata("out.fits").shape == SHAPE
 
-    def test_a_signal_while_an_error_is_told_ends_it_at_once(self):
+    def test_signal_during_error_output_ends_the_process_at_once(self):
         script = (
             "import os, signal, sys\n"
             "from lnocl.commands import cli\n"
@@ -79,7 +79,7 @@ class TestProcess:
 
     @pytest.mark.parametrize("closed", ["2>&-", ">&-", "<&- >&- 2>&-"])
     @pytest.mark.parametrize(("mu", "status"), [("0", 0), ("-1", 2)])
-    def test_nothing_is_said_where_a_stream_is_closed(self, closed, mu, status):
+    def test_closed_stream_causes_no_traceback(self, closed, mu, status):
         words = ["lnocl", *self.ARGUMENTS, "--mu", mu, "-o", "out.fits"]
         done = self.with_closed(closed, "-m", *words)
         assert done.returncode == status
@@ -90,7 +90,7 @@ class TestProcess:
         return subprocess.run(["bash", "-c", f"{command} {closed}"], capture_output=True, text=True)
 
     @pytest.mark.parametrize("command", [["--help"], ["--version"], ["devices"]])
-    def test_nor_by_what_says_nothing_else(self, command):
+    def test_closed_stdout_is_no_error_for_help_version_and_devices(self, command):
         assert self.with_closed(">&-", "-m", "lnocl", *command).returncode == 0
 
     def test_no_file_gets_the_number_of_a_closed_stream(self):
@@ -140,7 +140,7 @@ class TestProcess:
         thread.join()
         assert statuses == [0]
 
-    def test_a_stdout_of_ascii_shows_what_it_can(self):
+    def test_ascii_stdout_escapes_other_characters(self):
         done = outside(*self.ARGUMENTS, "-o", "naïve.fits", PYTHONIOENCODING="ascii")
         assert without_progress(done.stderr) == ""
         assert done.stdout.endswith("; na\\xefve.fits\n")
@@ -191,7 +191,7 @@ def test_a_limit_of_memory_that_is_too_low_is_one_line_at_once(threads):
 
 
 class TestDevices:
-    def test_it_lists_what_was_found_and_what_is_used_and_why(self, capsys):
+    def test_devices_command_lists_devices_and_the_reason_for_the_choice(self, capsys):
         assert cli.main(["devices"]) == 0
         *listed, used = capsys.readouterr().out.splitlines()
         found = device.find_devices()
@@ -205,9 +205,7 @@ class TestDevices:
             f"lnocl uses {device.spec_of(choice.device)} unless told otherwise: {choice.reason}"
         )
 
-    def test_what_is_fastest_is_measured_once_and_taken_from_then_on(
-        self, capsys, monkeypatch, tmp_path
-    ):
+    def test_fastest_tuning_is_measured_once_and_then_used(self, capsys, monkeypatch, tmp_path):
         """The times are made up: the second tuning is the faster one in single precision alone."""
         monkeypatch.setenv("POCL_CACHE_DIR", str(tmp_path))
         tried = {np.dtype(t): candidates(device.choose().device, np.dtype(t)) for t in "fd"}

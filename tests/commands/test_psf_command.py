@@ -174,7 +174,7 @@ class TestWhatItMakes:
         expected = 2 * np.pi * 4 * np.array([9000.0, 1500.0])
         np.testing.assert_allclose(flux, expected, rtol=0.05)
 
-    def test_several_stars_give_what_they_share_and_how_they_differ(self, capsys):
+    def test_several_stars_give_one_effective_psf_and_its_scatter(self, capsys):
         assert run("--star", "30,29", "--star", "50,45", "--size", "15") == 0
         expected = make_psf(FRAME, [(30, 29), (50, 45)], 15)
         with fits.open("out.fits", checksum=True) as hdus:
@@ -204,7 +204,7 @@ class TestWhatItMakes:
         assert read.observation.psf_error == expected
 
     @pytest.mark.parametrize(("word", "why"), [("wide", "not a number"), (0.7, "from 0 to 0.3")])
-    def test_an_error_of_the_width_that_is_none_is_refused(self, word, why):
+    def test_invalid_error_of_the_width_is_refused(self, word, why):
         header = fits.Header({"PSFERROR": word})
         fits.writeto("odd.fits", make_psf(FRAME, (30, 29), 15).psf, header)
         with pytest.raises(lnocl.InputError, match=why):
@@ -232,7 +232,7 @@ class TestWhatItMakes:
         assert errors[0] > errors[1]
         assert all("is found with a probability of 50 %" in said for said in limits)
 
-    def test_several_files_with_a_star_each_give_what_they_share(self, capsys):
+    def test_stars_in_several_files_give_one_effective_psf(self, capsys):
         names, chance = [], np.random.default_rng(3)
         for n, x, y, flux in [(31, 15.3, 14.8, 4e6), (35, 18.6, 16.1, 9e6), (33, 16.1, 16.4, 3e6)]:
             rows, columns = np.indices((n, n))
@@ -282,7 +282,7 @@ class TestCheck:
             "nothing speaks against it by itself",
         ]
 
-    def test_faults_are_said(self, capsys):
+    def test_oversampled_and_off_centre_psfs_are_reported(self, capsys):
         psf = star(33.0, 30.0)
         said = self.check(capsys, psf, OVERSAMP=4)
         assert said[0] == "its header has OVERSAMP 4: bin it to pixels of the detector"
@@ -313,7 +313,9 @@ class TestAStarOfTheTable:
             (["--stars", "one.csv", "--without", "30,29"], "leaves no star: give other stars"),
         ],
     )
-    def test_is_refused_where_it_is_none(self, capsys, options, message):
+    def test_star_to_exclude_that_is_missing_or_the_only_one_is_refused(
+        self, capsys, options, message
+    ):
         Path("stars.csv").write_text("x,y\n30.3,28.8\n50,45\n")
         Path("one.csv").write_text("x,y\n30.3,28.8\n")
         assert run(*options, "--size", "15") == 2
@@ -321,7 +323,7 @@ class TestAStarOfTheTable:
 
 
 class TestTheFile:
-    def test_the_header_says_what_was_done(self):
+    def test_psf_header_records_the_steps_and_the_command(self):
         options = ("--mask", "mask.fits", "--saturation", "8900", "--rotate", "0", "30")
         assert run(*options, "--size", "21", "--star", "30,29", "--clip-negative") == 0
         assert fitscheck.main(["--compliance", "out.fits"]) == 0
@@ -361,7 +363,7 @@ class TestTheFile:
             "--mask mask.fits --saturation 8900.0 --rotate 0.0 30.0 --clip-negative -o out.fits"
         )
 
-    def test_what_was_not_asked_for_is_not_in_the_header(self):
+    def test_psf_header_omits_steps_that_were_not_requested(self):
         assert run("--no-recentre", "--background", "40", "--clip-negative") == 0
         header = fits.getheader("out.fits")
         assert not {"SATURATE", "MSUM1", "ANGLE2", "FLUX2"} & set(header)
@@ -544,7 +546,7 @@ def contents():
 
 
 @pytest.mark.parametrize(("where", "options", "status", "message"), REFUSED.values(), ids=REFUSED)
-def test_what_is_refused(capsys, where, options, status, message):
+def test_invalid_input_is_refused_and_changes_no_file(capsys, where, options, status, message):
     before = contents()
     assert run(*options, **where) == status
     assert message in complaint(capsys.readouterr())

@@ -77,14 +77,14 @@ def test_the_file_has_the_psfs_and_their_parameters(capsys):
 
 
 @pytest.mark.exhaustive
-def test_what_does_not_fit_is_refined_where_that_is_asked(capsys):
+def test_misfitting_psf_is_refined_when_requested(capsys):
     assert run("--refine-psfs", "jitter") == 0
     assert "lnocl: PSFs refined, jitter fitted: misfit " in capsys.readouterr().err
     assert fits.getheader("out.fits")["PSFUSED"] is True
 
 
 @pytest.mark.exhaustive
-def test_none_are_refined_where_that_is_asked(capsys):
+def test_refinement_can_be_turned_off(capsys):
     assert run("--refine-psfs", "none", "--no-refine", "--verbose") == 0
     assert "lnocl: misfit of the PSFs " in capsys.readouterr().err
     header = fits.getheader("out.fits")
@@ -127,7 +127,7 @@ def test_files_of_pupils_and_scatter():
 
 
 @pytest.mark.exhaustive
-def test_doubtful_pixels_are_outlined_and_said(capsys):
+def test_doubtful_pixels_are_saved_and_outlined(capsys):
     fits.writeto("scatter.fits", 0.05 * PSF)
     assert run("--psf-errors", "scatter=scatter.fits") == 0
     assert cli.main(["plot", "out.fits", "--output", "figures"]) == 0
@@ -160,14 +160,14 @@ REFUSED = {
 
 
 @pytest.mark.parametrize(("options", "message"), REFUSED.values(), ids=REFUSED)
-def test_what_is_refused(options, message, capsys):
+def test_invalid_refinement_options_are_refused(options, message, capsys):
     fits.writeto("small.fits", np.ones((2, 5, 5)))
     assert run(*options) in (1, 2)
     assert message in capsys.readouterr().err
 
 
 @pytest.mark.exhaustive
-def test_an_error_that_is_left_is_said_in_the_verdict(capsys):
+def test_psf_error_left_after_refinement_shows_in_the_verdict(capsys):
     sky = SKY.copy()
     sky[STAR[::-1]] = 3e6
     ripple = 1.0 + 0.15 * np.cos(X * 0.9) * np.cos(Y * 0.7)

@@ -150,7 +150,9 @@ class TestRefusals:
             (OSError(28, "No space left on device"), 1, "No space left on device"),
         ],
     )
-    def test_what_stops_a_run_is_one_line(self, capsys, monkeypatch, error, status, message):
+    def test_interrupts_and_system_errors_are_reported_in_one_line(
+        self, capsys, monkeypatch, error, status, message
+    ):
         def fail(*arguments, **parameters):
             raise error
 

@@ -51,7 +51,7 @@ def command(tmp_path, monkeypatch):
 
 
 @pytest.mark.exhaustive
-def test_the_command_does_what_the_function_does_and_is_repeated(command, capsys):
+def test_star_psf_command_matches_the_function_and_is_repeated(command, capsys):
     assert cli.main([*command, "--star-psf", "22,25=behind.fits"]) == 0
     found = lnocl.deconvolve(observation(), [STAR, PLANET], n_iter=12, stop=None, engine="numpy")
     saved = read_result("out.fits")

@@ -80,7 +80,7 @@ def test_saturated_stars_are_named(capsys):
     assert "ra" not in stars.colnames
 
 
-def test_cosmic_rays_and_flat_tops_are_told(capsys):
+def test_cosmic_rays_and_flat_tops_are_reported(capsys):
     counts = fits.getdata("image.fits").clip(max=1500.0)
     counts[8, 50:54] = counts[50:54, 50] = 900.0, 930.0, 870.0, 910.0
     fits.writeto("image.fits", counts, overwrite=True)
@@ -116,7 +116,7 @@ def test_flags_and_weights_of_the_file_are_heeded(word, capsys):
     assert "image.fits has no extension DQ; give --mask as a file" in capsys.readouterr().err
 
 
-def test_where_there_is_no_star_it_says_what_to_do(capsys):
+def test_image_without_stars_gets_advice_and_an_empty_table(capsys):
     noise = np.random.default_rng(2).normal(50.0, 5.0, (N, N))
     fits.writeto("noise.fits", noise)
     assert cli.main(["stars", "noise.fits", "-o", "stars.ecsv"]) == 0
@@ -149,7 +149,7 @@ def test_refusals(arguments, status, message, capsys):
     assert Path("there.csv").read_text() == "kept"
 
 
-def test_without_photutils_one_line_says_what_to_install(monkeypatch, capsys):
+def test_missing_photutils_is_reported_with_its_install_command(monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "photutils.background", None)
     assert cli.main(["stars", "image.fits", "-o", "stars.ecsv"]) == 1
     assert "pip install photutils" in capsys.readouterr().err

@@ -33,7 +33,7 @@ def run(*options):
     return fits.getheader("out.fits")
 
 
-def test_an_unnamed_star_is_told_and_a_named_one_is_not(capsys):
+def test_unnamed_star_is_reported_and_a_named_one_is_not(capsys):
     run("--background", "100", "--star", "16,20")
     said = capsys.readouterr().out
     assert "1 source in the extended source is as sharp as stars, the brightest at (34, 30)" in said

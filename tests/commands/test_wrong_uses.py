@@ -97,7 +97,7 @@ CASES = [
 
 
 @pytest.mark.parametrize(("command", "lines"), CASES)
-def test_the_line_says_what_is_wrong_and_what_to_do(command, lines, folder, monkeypatch, capsys):
+def test_wrong_use_is_explained_with_a_remedy(command, lines, folder, monkeypatch, capsys):
     monkeypatch.chdir(folder)
     before = {path.name: path.stat().st_mtime_ns for path in folder.iterdir()}
     words = shlex.split(command.replace(";", r"\;"))

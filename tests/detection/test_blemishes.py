@@ -93,7 +93,7 @@ class TestFlatTops:
     def image(self, level):
         return np.round(frame(3.3, with_rays=False)).clip(max=level)
 
-    def test_their_stars_are_saturated_and_it_is_said(self, caplog):
+    def test_stars_with_flat_tops_are_saturated_and_reported(self, caplog):
         caplog.set_level("INFO", "lnocl")
         psf = lopsided(20, 20, 3.3, (41, 41))
         flat, given = (find_stars(self.image(1500.0), psf, saturation=s) for s in (None, 1500.0))
@@ -107,7 +107,7 @@ class TestFlatTops:
 
     @pytest.mark.parametrize("seed", range(5))
     @pytest.mark.parametrize("level", [0.05, 3.0, 200.0])
-    def test_counts_that_are_alike_by_chance_are_none(self, seed, level):
+    def test_counts_equal_by_chance_are_not_flat_tops(self, seed, level):
         light = level + sum(200.0 * level * lopsided(*at, 9.0, SHAPE) for at in PLACES)
         counts = np.random.default_rng(seed).poisson(light).astype(float)
         none = np.zeros(SHAPE, bool)

@@ -60,7 +60,7 @@ def test_units_do_not_matter(scale):
     np.testing.assert_allclose(one["significance"], other["significance"])
 
 
-def test_in_noise_alone_there_are_none():
+def test_noise_alone_gives_no_stars():
     none = make_image(places=PLACES[:0], peaks=PEAKS[:0])
     assert len(find_stars(none)) == 0
     assert len(find_stars(none, PSF)) == 0
@@ -79,7 +79,7 @@ def test_a_slope_and_an_extended_source_are_no_stars():
     assert_found(find_stars(image, PSF), within=0.4)
 
 
-def test_what_lies_in_the_wings_is_no_star_unless_it_is_brighter():
+def test_peaks_in_psf_wings_are_stars_only_where_brighter_than_the_wings():
     rows, columns = np.indices((61, 61)) - 30
     ring = gaussian(30, 30, shape=(61, 61))
     ring += 0.03 * np.exp(-((np.hypot(columns - 7, rows)) ** 2) / 4.5)  # a speckle
@@ -155,7 +155,7 @@ class TestOtherProfiles:
         _, image = self.speckled(0.03, [(5, 0)])
         assert len(find_stars(image, self.speckled(0.02, [(5, 0)])[0])) == 1
 
-    def test_without_a_psf_faint_speckles_beside_a_star_are_none(self):
+    def test_faint_speckles_are_no_stars_without_a_psf(self):
         _, image = self.speckled(0.02, 3.0 * np.array([(0.96, 0.3), (-0.74, 0.68), (-0.21, -0.98)]))
         assert len(find_stars(image)) == 1
 
@@ -277,7 +277,7 @@ def test_refusals(image, given, message):
 @pytest.mark.exhaustive
 @pytest.mark.parametrize("share", [0.35, 0.51, 0.7])
 @pytest.mark.parametrize("outside", [0.0, np.nan])
-def test_what_is_outside_the_field_has_no_stars(share, outside):
+def test_pixels_outside_the_field_give_no_stars(share, outside):
     inside = PLACES[:, 0] > share * SHAPE[1] + 4
     image = make_image(4, places=PLACES[inside], peaks=PEAKS[inside])
     image[:, : int(share * SHAPE[1])] = outside
@@ -304,7 +304,7 @@ def test_a_flat_image_has_no_star(value):
     assert len(find_stars(np.full((40, 40), value))) == 0
 
 
-def test_without_photutils_one_line_says_what_to_install(monkeypatch):
+def test_missing_photutils_raises_an_error_with_its_install_command(monkeypatch):
     monkeypatch.setitem(sys.modules, "photutils.background", None)
     with pytest.raises(LnoclError, match=r"pip install photutils$"):
         find_stars(make_image())

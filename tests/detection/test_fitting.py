@@ -27,7 +27,7 @@ def star(x, y):
     return MOVABLE.with_slopes(x, y).add_to(np.zeros((3, *SHAPE)), (0, 0), ENDLESS)
 
 
-def test_amounts_are_those_of_weighted_least_squares_and_dark_images_have_none():
+def test_amounts_match_weighted_least_squares_and_are_zero_for_dark_images():
     rng = np.random.default_rng(4)
     parts, light = rng.normal(size=(3, *SHAPE)), rng.normal(size=SHAPE)
     weights = rng.uniform(0.1, 2.0, SHAPE) * (rng.random(SHAPE) > 0.2)

@@ -217,7 +217,7 @@ def test_an_edge_has_alarms_of_its_own():
     assert found / 800 == pytest.approx(0.5, abs=3 * np.sqrt(0.5 / 800))
 
 
-def test_a_maximum_beside_others_has_what_points_there_leave():
+def test_score_of_a_blended_maximum_matches_a_joint_fit():
     """Values of independent noise with a Gaussian's correlation, fitted by all points at once."""
     null = dark_null(scene_of(), FLUXES)
     found, places = ScoreMap(null, 0.0), np.array([[10.0, 10.0], [12.3, 10.6], [9.1, 13.0]])
@@ -354,7 +354,7 @@ def test_values_scatter_as_noise_does():
     assert abs(np.nanmean(values)) < 0.02
 
 
-def test_a_bright_source_is_no_part_of_what_lies_round_it():
+def test_bright_source_does_not_bias_the_score_around_it():
     """Its wings are not, nor is it in the level: that would leave a hole of three resolutions."""
     rng = np.random.default_rng(5)
     rows, columns = np.indices((49, 49)) - 24
@@ -519,7 +519,7 @@ def test_noise_of_rings_is_known_as_well_at_all_their_radii():
     assert found.degrees[is_faint].min() > 50  # what it adds is known not to be much
 
 
-def test_what_the_run_has_found_of_psfs_is_the_least():
+def test_score_noise_includes_at_least_the_psf_error_of_the_run():
     score, rings, light = noisy(0.0, told=0.1)
     found = noise_of(score, rings, score.is_tested)
     assert (found.scatter >= np.sqrt(1.0 + 0.01 * light) - 1e-9).all()

@@ -130,7 +130,7 @@ def test_it_has_settled_by_the_mean_change_over_ten_iterations(last):
     assert (steps.reason, len(objectives) - 1) == (SETTLED, 20 if last else 11)
 
 
-def test_a_target_pauses_it_and_what_is_queued_behind_does_nothing():
+def test_target_pauses_the_run_and_queued_steps_have_no_effect():
     steps, objectives = Steps(share=1.0, slope=-1.0, target=3.0, recorded=1.0), [5.0]
     for objective in (4.0, 3.0, 2.0):
         record(steps, objectives, objective)
@@ -221,7 +221,7 @@ def test_an_end_in_the_middle_of_a_queue_is_where_it_would_be(engine, solver):
     np.testing.assert_array_equal(ended.star_fluxes(), until.star_fluxes())
 
 
-def test_what_is_not_finite_is_refused():
+def test_non_finite_image_pixel_stops_the_run_with_an_error():
     made = Recipe((16, 32), 3, 2, background="each").make()
     setup = Setup(made.observation(), made.stars, 0, "sgp", "double", "numpy", None)
     run = Run(make_start(setup, Penalty()), 9)

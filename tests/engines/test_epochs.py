@@ -107,7 +107,7 @@ def bad_first_star():
 
 @pytest.mark.exhaustive
 @pytest.mark.filterwarnings("ignore:the star at .* is on no good pixel of epoch 2")
-def test_a_flux_that_no_image_shows_is_nan_wherever_fluxes_are_told(tmp_path):
+def test_flux_without_good_pixels_is_nan_in_all_outputs(tmp_path):
     given, seen, lost = nights(bad_first_star()), [], [False, False, True, False, False, False]
     path = str(tmp_path / "run.fits")
     options = {"n_iter": 12, "engine": "numpy", "checkpoint": path}
@@ -136,7 +136,7 @@ def test_a_flux_that_no_image_shows_is_nan_wherever_fluxes_are_told(tmp_path):
 
 @pytest.mark.exhaustive
 @pytest.mark.filterwarnings("ignore:the star at .* is on no good pixel of epoch 2")
-def test_what_is_made_of_light_curves_leaves_out_fluxes_that_no_image_shows():
+def test_light_curve_products_omit_fluxes_without_good_pixels():
     result = paper(nights(bad_first_star()), PLACES, n_iter=8, engine="numpy")
     table = result.bootstrap(10).to_table()
     of_first = [f"star 1 epoch {e} flux" for e in (0, 1)]
@@ -198,7 +198,7 @@ def test_engines_agree(precision, allowed):
 
 
 @pytest.mark.exhaustive
-def test_one_epoch_is_none():
+def test_single_epoch_equals_no_epochs():
     one, none = (
         paper(given, STARS, n_iter=8, engine="numpy")
         for given in (observation(epochs=[7, 7, 7]), observation())
@@ -221,7 +221,7 @@ def test_a_star_is_in_the_images_of_its_epoch_alone():
 
 
 @pytest.mark.exhaustive
-def test_what_is_expected_under_a_star_does_not_hang_on_the_number_of_epochs():
+def test_light_expected_under_a_star_is_independent_of_the_number_of_epochs():
     """Else the edge of its core would be filled once for each."""
     found = []
     for scene in (Scene(observation(epochs=EPOCHS), STARS), Scene(observation(), STARS)):
@@ -301,6 +301,6 @@ def test_replicas_name_star_and_epoch():
 
 
 @pytest.mark.exhaustive
-def test_what_is_refused():
+def test_epochs_of_the_wrong_shape_are_refused():
     with pytest.raises(lnocl.LnoclError, match=r"epochs`? has shape"):
         observation(epochs=[1, 2])

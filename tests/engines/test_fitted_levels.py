@@ -62,13 +62,13 @@ def test_with_a_number_for_smoothing_a_level_stays_and_its_error_is_in_all_error
     assert (free.star_flux_errors > known.star_flux_errors).all()
 
 
-def test_the_level_is_told_with_its_error(log):
+def test_fitted_level_is_reported_with_its_error(log):
     reconstruct(0, LEVEL, 1.0)
     (line,) = [each for each in log.messages if "fitted with the rest" in each]
     assert line.startswith("image 0: background 8")
 
 
-def test_levels_are_said_without_the_read_noise_that_is_in_them():
+def test_reported_levels_exclude_the_read_noise_term():
     observed = {"background": np.full((1, 1, 1), 29.0), "read_noise": np.full((1, 1, 1), 3.0)}
     scene = SimpleNamespace(observation=SimpleNamespace(**observed))
     levels = SimpleNamespace(errors=np.array([[0.25]]))

@@ -268,7 +268,7 @@ BAD = {
 
 
 @pytest.mark.parametrize("message", BAD)
-def test_what_is_refused(message):
+def test_invalid_halos_are_refused_in_one_line(message):
     halo = BAD[message]
     if isinstance(halo, tuple):
         y, x, value = halo
@@ -280,7 +280,7 @@ def test_what_is_refused(message):
     assert "\n" not in str(caught.value)
 
 
-def test_what_is_not_taken_beside_halos():
+def test_tiles_and_fully_masked_images_are_refused_with_halos():
     given = observation()
     with pytest.raises(lnocl.InputError, match="a tile cannot tell the halos"):
         lnocl.deconvolve_tiles(given, [STAR], engine="numpy")

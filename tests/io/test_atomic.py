@@ -70,7 +70,7 @@ class TestEveryWriter:
     @pytest.mark.parametrize("there", [False, True])
     @pytest.mark.parametrize("call", ["fsync", "replace"])
     @pytest.mark.parametrize("error", [FULL, KeyboardInterrupt()])
-    def test_a_failure_leaves_what_was_there(
+    def test_failed_write_preserves_the_existing_file(
         self, tmp_path, monkeypatch, write, there, call, error
     ):
         path = tmp_path / "out.fits"
@@ -99,7 +99,7 @@ class TestEveryWriter:
         assert names(tmp_path) == ["out.fits"]
         assert path.read_bytes() == b"old"
 
-    def test_a_file_that_came_into_being_meanwhile_is_kept(self, tmp_path, write):
+    def test_existing_file_is_not_overwritten_by_default(self, tmp_path, write):
         path = tmp_path / "out.fits"
         path.write_bytes(b"old")
         with pytest.raises(FileError, match="exists"):
@@ -144,7 +144,7 @@ class TestUpdateFile:
         assert sorted(path.read_bytes()) == list(range(12))
         assert names(tmp_path) == ["a"]
 
-    def test_what_others_write_without_the_lock_is_kept(self, tmp_path):
+    def test_update_includes_content_that_others_write_without_the_lock(self, tmp_path):
         path, other = tmp_path / "a", tmp_path / "b"
         path.write_bytes(b"1")
         calls = []
@@ -192,7 +192,7 @@ class TestUpdateFile:
         atomic.update_file(str(path), lambda stream: stream.write(b"2"))
         assert names(tmp_path) == ["a"]
 
-    def test_a_long_wait_is_told(self, tmp_path, monkeypatch):
+    def test_long_wait_for_a_lock_is_reported(self, tmp_path, monkeypatch):
         monkeypatch.setattr(atomic, "LONG", 0.0)
         path = tmp_path / "a"
         path.write_bytes(b"1")
@@ -233,7 +233,7 @@ class TestWholeFile:
         assert seen == [("fsync", False, [5]), ("replace", False, [5])]
         assert path.read_bytes() == b"lnocl"
 
-    def test_an_error_of_the_writer_stays_what_it_is(self, tmp_path):
+    def test_exception_of_the_writer_is_raised_unchanged(self, tmp_path):
         with pytest.raises(ZeroDivisionError), atomic.whole_file(str(tmp_path / "a")) as stream:
             stream.write(bytes(1 // 0))
         assert names(tmp_path) == []
@@ -356,7 +356,7 @@ checked_or_written = pytest.mark.parametrize(
 
 
 @checked_or_written
-def test_a_signal_that_comes_as_a_file_is_made_leaves_none(work, tmp_path, monkeypatch):
+def test_signal_during_file_creation_leaves_no_file(work, tmp_path, monkeypatch):
     genuine = atomic._create
 
     def interrupted(path):
@@ -376,7 +376,7 @@ def age(path, days=2):
 
 
 @checked_or_written
-def test_what_a_killed_process_left_is_removed(work, tmp_path):
+def test_temporary_file_of_a_killed_process_is_removed_after_a_day(work, tmp_path):
     code = (
         "import os, signal, sys; from lnocl.io import atomic\n"
         "with atomic.whole_file(sys.argv[1]) as stream:\n"
@@ -393,7 +393,7 @@ def test_what_a_killed_process_left_is_removed(work, tmp_path):
     assert not left.exists()
 
 
-def test_what_another_process_writes_stays(tmp_path):
+def test_temporary_file_of_a_running_process_is_not_removed(tmp_path):
     with atomic.whole_file(str(tmp_path / "one.txt")) as stream:
         stream.write(b"words")
         stream.flush()
@@ -404,7 +404,7 @@ def test_what_another_process_writes_stays(tmp_path):
     assert names(tmp_path) == ["one.txt", "two.txt"]
 
 
-def test_what_is_no_temporary_file_stays(tmp_path):
+def test_folders_links_and_other_names_are_not_removed_as_temporary(tmp_path):
     name = ".lnocl-0123456789abcdef.tmp"
     (tmp_path / "folder" / name).mkdir(parents=True)
     (tmp_path / f"{name}.fits").write_text("mine")

@@ -241,7 +241,7 @@ class TestCoordinates:
         assert cards["RADESYS"] == "FK5"
         WCS(cards)
 
-    def test_sip_without_its_suffix_says_nothing_and_is_kept(self, capfd):
+    def test_sip_coefficients_without_the_ctype_suffix_are_copied_silently(self, capfd):
         cards = fitsread.wcs_cards(fits.Header(SIP | {"CTYPE1": "RA---TAN", "CTYPE2": "DEC--TAN"}))
         assert capfd.readouterr() == ("", "")
         assert cards["A_2_0"] == SIP["A_2_0"]
@@ -256,7 +256,7 @@ class TestCoordinates:
         ],
         ids=["axes", "singular", "tab"],
     )
-    def test_coordinates_that_cannot_be_kept_are_announced(self, broken):
+    def test_unusable_wcs_is_left_out_with_a_warning(self, broken):
         with pytest.warns(LnoclWarning, match="of the first image cannot be copied"):
             cards = fitsread.wcs_cards(fits.Header(LINEAR | broken))
         assert len(cards) == 0
@@ -266,7 +266,7 @@ class TestCoordinates:
         fits.writeto(tmp_path / "a.fits", np.ones(shape))
         assert fitsread.read_stack([str(tmp_path / "a.fits")]).data.shape == (1, *shape)
 
-    def test_distortions_in_tables_are_left_out_and_said(self, caplog):
+    def test_lookup_table_distortions_are_left_out_and_reported(self, caplog):
         tabled = {"CPDIS1": "Lookup", "DP1.EXTVER": 1.0, "D2IMDIS2": "LOOKUP", "D2IMERR2": 0.06}
         with caplog.at_level("INFO", "lnocl"):
             cards = fitsread.wcs_cards(fits.Header(LINEAR | tabled))

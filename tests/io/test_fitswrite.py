@@ -122,7 +122,7 @@ NAMES = st.text(
 
 class TestHistoryLines:
     @given(words=st.lists(NAMES, min_size=1, max_size=6))
-    def test_a_shell_reads_from_the_header_what_was_given(self, words):
+    def test_history_cards_run_by_a_shell_reproduce_the_arguments(self, words):
         header = fits.Header()
         for line in fitswrite.history_lines(["printf", "%s\\0", *words]):
             assert len(line) <= 72

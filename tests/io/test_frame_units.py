@@ -113,7 +113,7 @@ class TestUnits:
         assert (found.gain, found.electrons, found.unit) == (2.5, 2.5, "adu")
         assert notes(log) == ["image 0: gain 2.5, from EGAIN", "image 1: gain 2.5, from EGAIN"]
 
-    def test_gains_in_headers_that_are_none(self):
+    def test_invalid_and_unequal_gains_in_headers_are_refused(self):
         save_images(BUNIT="adu", EGAIN=2.5, TEXT="a", ZERO=0.0)
         with pytest.raises(InputError, match=r"^1\.fits has no GAIN in its header; give gain as a"):
             observe(gain="GAIN")
@@ -206,7 +206,7 @@ class TestUnits:
             ("", {"gain": "EGAIN"}, "its unit is taken to be counts"),
         ],
     )
-    def test_what_the_header_has_is_named_with_what_to_type(self, log, unit, known, said):
+    def test_gain_and_exposure_keywords_in_the_header_are_suggested(self, log, unit, known, said):
         save_images(BUNIT=unit, GAIN=0.0, EGAIN=2.5, EXPTIME=30.0)
         if unit:
             with pytest.raises(InputError) as caught:

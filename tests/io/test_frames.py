@@ -36,7 +36,7 @@ class TestExposure:
         mixed = observe(exposure=["map.fits", 5.0]).exposure
         np.testing.assert_array_equal(mixed, [MAP, np.full(SHAPE, 5.0)])
 
-    def test_where_there_is_none_pixels_are_bad(self, log):
+    def test_pixels_without_exposure_are_masked(self, log):
         save_images(BUNIT="e-/s")
         exposure = MAP.copy()
         exposure[2, 3:5] = 0.0
@@ -166,7 +166,7 @@ class TestBackground:
             )
         assert found.background == [5.0]
 
-    def test_what_was_subtracted_too_much_is_added_and_the_noise_measured(self, log):
+    def test_oversubtracted_sky_is_added_back_and_its_noise_measured(self, log):
         save_images(IMAGES - 60.0)
         found = read("1.fits", background=["auto"])
         (level,) = found.background
@@ -309,7 +309,7 @@ class TestNoise:
                 "1 pixel whose error is less than the noise of its counts has none"
             )
 
-    def test_what_the_sky_has_beyond_its_counts(self, log):
+    def test_auto_read_noise_is_the_variance_beyond_the_counts(self, log):
         """Of a sky of 50 electrons, 30 of which were subtracted, and a read noise of 8."""
         rng = np.random.default_rng(0)
         images = rng.poisson(50.0, (2, 100, 100)) - 30.0 + rng.normal(0.0, 8.0, (2, 100, 100))
@@ -440,7 +440,7 @@ class TestMask:
         assert flags[masked].tolist() == [each for each in sums if each in expected]
 
     @pytest.mark.parametrize("bits", ["", "a", "3,5", "-1", "1.5", "~", "16 64"])
-    def test_what_are_no_flags(self, bits):
+    def test_invalid_dq_flags_are_refused(self, bits):
         save_with_dq("1.fits", IMAGES[0], NONE[0].astype("i2"))
         with pytest.raises(InputError) as caught:
             observe("1.fits", mask=[f"dq:{bits}"])
@@ -491,7 +491,7 @@ class TestMask:
             for j, count in enumerate(expected)
         ]
 
-    def test_without_any_nothing_is_masked_or_said(self, log):
+    def test_default_mask_is_empty_and_not_reported(self, log):
         save_images()
         assert not observe().mask.any()
         assert notes(log) == []
@@ -619,7 +619,7 @@ class TestPixelScales:
         ],
         ids=["PIXELSCL", "PIXSCALE", "WCS"],
     )
-    def test_a_psf_of_other_pixels_is_said(self, cards):
+    def test_psf_with_another_pixel_scale_is_reported(self, cards):
         (message,) = self.said(cards)
         assert message == (
             "the pixels of psf 0 are of 0.0125 arcsec, those of its image of 0.05: give "
@@ -634,7 +634,7 @@ class TestPixelScales:
     def test_others_are_not(self, cards):
         assert self.said(cards) == []
 
-    def test_a_psf_finer_than_the_detector_is_said(self):
+    def test_psf_finer_than_the_detector_is_reported(self):
         (message,) = self.said({"OVERSAMP": 4})
         assert message == (
             "psf 0 is sampled 4 times finer than the detector, by OVERSAMP in its header: give "

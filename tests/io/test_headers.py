@@ -5,7 +5,7 @@ from astropy.io import fits
 from lnocl.io.headers import observed_cards
 
 
-def test_what_was_observed_is_kept():
+def test_observation_keywords_are_copied_from_the_first_image():
     header = fits.Header({"OBJECT": "RW Aur", "EXPTIME": 30.0, "FILTER": 7, "OBSERVER": "A"})
     primary = fits.Header({"TELESCOP": "HST", "FILTER": "of the file", "DETECTOR": "WFC"})
     header["DATE-OBS"] = None

@@ -86,7 +86,7 @@ def test_regions_may_be_given_themselves():
         ("image\ncircle(20,20,1e7)", r"^region 1 \(circle\) lies outside the image of 50 x 40"),
     ],
 )  # fmt: skip
-def test_what_cannot_be_measured_is_refused(text, message, tmp_path):
+def test_regions_that_cannot_be_measured_are_refused(text, message, tmp_path):
     with pytest.raises(lnocl.InputError, match=message):
         read(text, tmp_path)
 
@@ -104,7 +104,7 @@ def test_a_file_without_regions_is_refused(text, tmp_path):
         read(text, tmp_path)
 
 
-def test_a_missing_file_and_what_is_no_region_are_refused(tmp_path):
+def test_missing_region_file_and_invalid_regions_are_refused(tmp_path):
     with pytest.raises(lnocl.FileError, match=r"nix\.reg is not there: give a file of regions"):
         read_apertures(tmp_path / "nix.reg", None, SHAPE)
     with pytest.raises(lnocl.InputError, match=r"^regions must be those of the package regions; 3"):

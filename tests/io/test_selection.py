@@ -122,7 +122,7 @@ def test_the_one_that_is_named(tmp_path, part):
     assert fitsread.read_keyword(path + part, found.header, "SIMPLE") is True
 
 
-def test_what_belongs_to_the_one_that_is_named(tmp_path):
+def test_extension_with_the_version_of_the_named_image_is_read(tmp_path):
     path = chips(tmp_path / "a.fits")
     np.testing.assert_array_equal(fitsread.read_extension(f"{path}[SCI,2]", "DQ"), 10.0 * IMAGE)
     assert fitsread.read_extension(f"{path}[SCI,2]", "ERR") is None

@@ -80,7 +80,7 @@ class TestOffsets:
         found = sky.transforms(headers, ["a", "b"], [SHAPE, SHAPE])[:, :, 2]
         np.testing.assert_allclose(found[1], moved.mean(axis=(1, 2)), atol=1e-3)
 
-    def test_a_little_turn_is_none(self):
+    def test_small_rotation_is_neglected(self):
         # 0.5 degrees move the corners by 7.5 pixels times 0.0087.
         found = sky.transforms([header(), header(angle=0.5)], ["a", "b"], [SHAPE, SHAPE])
         np.testing.assert_array_equal(found[1, :, :2], np.eye(2))
@@ -146,7 +146,7 @@ class TestPositions:
         ["", "1", "15.25,-3:30:00", "x,y", "10d,95d", "25:00:00,3:00:00", "1,2,3", "nand,5d",
          "infd,5d", "10d,", ",10d", "1:61:00,5:00:00", "15.25,-3.5d", "10d,5d,3d"],
     )  # fmt: skip
-    def test_what_is_no_position(self, text):
+    def test_invalid_positions_are_refused(self, text):
         with pytest.raises(InputError) as caught:
             sky.parse_sky(["1d,2d", text])
         assert str(caught.value) == (
@@ -155,7 +155,7 @@ class TestPositions:
         )
 
     @pytest.mark.parametrize("given", [header(), with_sip()])
-    def test_what_the_projection_does_not_show(self, given):
+    def test_position_outside_the_projection_is_refused(self, given):
         wcs = sky.celestial_wcs(given, "a.fits")
         coordinates = sky.parse_sky(["150d,30d", "330d,-30d"])
         with pytest.raises(InputError) as caught:
@@ -169,7 +169,7 @@ class TestPositions:
         [fits.Header(), fits.Header({"CTYPE1": "LINEAR", "CTYPE2": "LINEAR"}), header(**SOLAR),
          header(CD1_1=0.0, CD2_2=0.0, CD1_2=0.0, CD2_1=0.0), header(RADESYS="GAPPT")],
     )  # fmt: skip
-    def test_coordinates_that_are_none(self, given):
+    def test_header_without_a_usable_celestial_wcs_is_refused(self, given):
         assert not sky.has_celestial(given)
         with pytest.raises(InputError) as caught:
             sky.celestial_wcs(given, "a.fits")
@@ -246,7 +246,7 @@ class TestTables:
             ({}, {"DATE-OBS": "2024-01-01"}, "there is no column ref_epoch"),
         ],
     )
-    def test_proper_motions_that_cannot_be_heeded_are_said(self, caplog, columns, cards, lacking):
+    def test_unusable_proper_motions_are_reported(self, caplog, columns, cards, lacking):
         caplog.set_level(logging.INFO, "lnocl")
         motions = {"pmra": [1e3, 1e3], "pmdec": [1e3, 1e3]}
         Table({"ra": ICRS.ra.deg, "dec": ICRS.dec.deg, **motions, **columns}).write("t.ecsv")

@@ -53,7 +53,7 @@ def first_run(folder, before=""):
     ],
     ids=["done", "instead of a trial", "failed", "worker", "one core", "no process"],
 )
-def test_another_process_compiles_what_is_needed_last(tmp_path, before, expected, ended):
+def test_kernels_needed_last_are_compiled_by_another_process(tmp_path, before, expected, ended):
     cold = first_run(tmp_path, before)
     assert cold[:2] == ["False False", expected]
     assert cold[3] == ended
@@ -71,7 +71,7 @@ print(child.pid)
 
 @on_pocl
 @pytest.mark.system
-def test_what_nobody_waits_for_ends_with_the_process(tmp_path):
+def test_unneeded_compilation_ends_with_the_process(tmp_path):
     done = run_python(UNNEEDED, POCL_CACHE_DIR=str(tmp_path))
     assert (done.returncode, done.stderr) == (0, "")
     state = Path("/proc", done.stdout.strip(), "stat")
@@ -107,7 +107,7 @@ def test_a_program_has_its_own_kernels_on_their_lines(kernel):
     assert all(one in ("", other) for one, other in lines)
 
 
-def test_numbers_of_arguments_are_told_from_arrays():
+def test_scalar_kernel_arguments_are_distinguished_from_arrays():
     types = sources.arguments(program.source())["step_rows"]
     assert types["mu"].split() == ["const", "real"]
     assert types["has_weights"].split() == ["const", "int"]

@@ -101,7 +101,7 @@ def test_other_numbers_of_threads_are_taken(machine, monkeypatch, threads):
 
 
 @pytest.mark.parametrize("spec", ["2", "0:2", "nosuch", "vendor:cpu", "", ":0"])
-def test_unknown_device_is_refused_with_what_there_is(machine, spec):
+def test_unknown_device_is_refused_with_a_list_of_devices(machine, spec):
     with pytest.raises(
         lnocl.InputError, match=r"fits no OpenCL device; give one of these: 0:0 for Slow CPU"
     ) as error:
@@ -210,7 +210,7 @@ def test_too_little_memory_is_refused_before_anything_is_allocated(monkeypatch, 
         pytest.param((64, 32), Tuning(4, 16, scratch_is_global=True), marks=pytest.mark.exhaustive),
     ],
 )
-def test_memory_estimate_is_what_the_buffers_hold(shape, tuning, caplog):
+def test_memory_estimate_equals_the_size_of_the_buffers(shape, tuning, caplog):
     """With scratch in local memory, of which 32 KiB will do, and with scratch in global memory."""
     caplog.set_level("DEBUG", "lnocl")
     observation = lnocl.Observation(np.ones((2, *shape)), np.ones((1, 1)))

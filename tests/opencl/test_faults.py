@@ -67,7 +67,7 @@ SHORT = [
 
 @pytest.mark.parametrize(("kind", "code"), SHORT)
 @pytest.mark.parametrize("call", ["Buffer", "enqueue_nd_range_kernel", "enqueue_copy"])
-def test_too_little_memory_is_said_with_what_is_needed(monkeypatch, kind, code, call):
+def test_insufficient_device_memory_is_reported_with_the_size_needed(monkeypatch, kind, code, call):
     error = error_of(kind, code, call)
     # A new list each time: monkeypatching cl.Buffer hides the class from isinstance elsewhere.
     monkeypatch.setattr(cl, call, fail_with(error)(getattr(cl, call)))
@@ -92,7 +92,7 @@ def describe():
     ],
 )
 @pytest.mark.parametrize("solver", ["sgm", "sgp"])
-def test_a_lost_device_is_said_while_it_iterates(monkeypatch, kind, code, solver):
+def test_device_lost_during_iterations_is_reported(monkeypatch, kind, code, solver):
     error = error_of(kind, code, "clEnqueueNDRangeKernel")
     wrapped = fail_with(error, after=60)(cl.enqueue_nd_range_kernel)
     monkeypatch.setattr(cl, "enqueue_nd_range_kernel", wrapped)
@@ -270,9 +270,7 @@ def poison(engine, what):
 
 @pytest.mark.parametrize("every", [0.0, 1e9])
 @pytest.mark.parametrize("solver", ["sgm", "sgp"])
-def test_an_estimate_is_proven_by_its_objective_before_it_is_kept(
-    solver, every, monkeypatch, tmp_path
-):
+def test_only_estimates_with_a_finite_objective_are_returned(solver, every, monkeypatch, tmp_path):
     """Where a finite estimate has an infinite objective, again and again."""
     path = tmp_path / "run.fits"
     monkeypatch.setattr(checkpoint, "EVERY", every)
@@ -344,7 +342,7 @@ def test_a_device_that_always_computes_nan_is_refused(monkeypatch, engine, solve
 
 @pytest.mark.parametrize("solver", ["sgm", "sgp"])
 @pytest.mark.parametrize("what", ["extended", "images"])
-def test_a_checkpoint_is_not_replaced_by_what_is_not_finite(tmp_path, monkeypatch, solver, what):
+def test_non_finite_state_does_not_replace_a_checkpoint(tmp_path, monkeypatch, solver, what):
     """Resumed, the run ends as if nothing had happened."""
 
     def callback(iteration, estimate):

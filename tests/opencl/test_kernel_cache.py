@@ -119,7 +119,7 @@ def test_a_disk_that_is_full_leaves_no_part_of_a_file(tmp_path, monkeypatch):
 
 @on_pocl
 @pytest.mark.system
-def test_a_folder_that_cannot_hold_programs_is_said_once(tmp_path):
+def test_unusable_cache_folder_is_reported_once(tmp_path):
     (tmp_path / "file").touch()
     code = "print(deconvolve(), deconvolve())"
     done = run_python(code, POCL_CACHE_DIR=str(tmp_path / "file" / "folder"))
@@ -184,7 +184,7 @@ class TestStrangers:
         assert (tmp_path / "store").stat().st_mode & 0o777 == 0o700
         assert (tmp_path / "store" / "a.kernels").stat().st_mode & 0o777 == 0o600
 
-    def test_what_is_no_archive_is_as_if_it_were_not_there(self):
+    def test_invalid_archive_is_ignored(self):
         assert kernel_cache.unpack(b"PK\x03\x04 and nothing else") == set()
 
 

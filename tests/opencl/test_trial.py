@@ -50,7 +50,7 @@ def without_linker(tmp_path, monkeypatch):
         ("ld: weather", "ld: weather"),
     ],
 )
-def test_it_is_said_in_one_line(without_linker, words, cause):
+def test_linker_failure_is_reported_in_one_line(without_linker, words, cause):
     without_linker(words)
     done = run_python(TOLD)
     assert (done.returncode, done.stderr) == (0, "")
@@ -206,7 +206,7 @@ def test_kernels_go_where_they_can_be_run(lack, tmp_path, monkeypatch):
     assert kernel_cache._Folder().path.parent == tmp_path / "temporary"
 
 
-def test_no_usable_folder_for_temporary_files_is_said(tmp_path, monkeypatch):
+def test_store_is_used_where_no_temporary_folder_is_usable(tmp_path, monkeypatch):
     """A path that is too long for SQLite, and no folder at all; the store is taken instead."""
     monkeypatch.setenv("POCL_CACHE_DIR", str(tmp_path))
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path / ("x" * 400)))

@@ -161,7 +161,7 @@ def test_the_default_is_the_first_candidate():
 
 
 @pytest.mark.parametrize("given", [CPU, GPU], ids=["CPU", "GPU"])
-def test_what_was_measured_is_taken_for_this_device_and_precision_alone(given):
+def test_measured_tuning_applies_to_its_device_and_precision_only(given):
     fastest = candidates(given, SINGLE)[1]
     assert measured(given, SINGLE) is None
     assert store(given, {SINGLE: fastest}).is_file()
@@ -199,7 +199,7 @@ def test_a_damaged_file_is_not_used(cut):
 
 
 @pytest.mark.parametrize("place", ["folder", "file"])
-def test_what_cannot_be_stored_is_said(folder, monkeypatch, place):
+def test_tuning_that_cannot_be_stored_raises_a_file_error(folder, monkeypatch, place):
     if place == "file":
         module._file(CPU).mkdir()
     else:

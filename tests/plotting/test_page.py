@@ -80,7 +80,7 @@ def test_the_offset_of_an_image_moves_its_corner():
 
 
 @pytest.mark.parametrize("oversample", [1, 2])
-def test_what_errors_of_the_psf_may_fake_is_outlined(oversample):
+def test_doubtful_pixels_are_outlined_on_the_page(oversample):
     doubtful = np.zeros((60 * oversample, 70 * oversample), bool)
     doubtful[20 * oversample : 30 * oversample, 5 * oversample : 9 * oversample] = True
     view = make_view(p=0, doubtful=doubtful, extended=1.0 * doubtful, oversample=oversample)
@@ -210,14 +210,14 @@ class TestCommand:
         assert data_of(page)["stars"] == [[-1.0, 4.0]]
         assert "café \\ tab" in page
 
-    def test_a_result_without_models_says_what_it_lacks(self, capsys):
+    def test_report_without_models_names_the_missing_models(self, capsys):
         fitswrite.write_result("b.fits", np.ones((32, 32)), [], [])
         assert cli.main(["report", "b.fits", "-o", "b.html"]) == 0
         page = Path("b.html").read_text()
         assert "The file has no models and residuals: repeat the run with both." in page
         assert data_of(page)["regions"][0]["images"] == []
 
-    def test_whether_to_trust_it_comes_first_and_is_said_once(self):
+    def test_verdict_comes_first_and_appears_once(self):
         fault = "the model does not fit at 1 of 1 star, (3, 4): give a better PSF"
         said = ["star 1  7.5 adu", f"trust   no: {fault}", "        a source is not named"]
         said += ["9 steps", "", f"warning: {fault}", "warning: it is noisy"]
@@ -227,7 +227,7 @@ class TestCommand:
         assert "<pre>star 1  7.5 adu\n9 steps</pre>" in page
         assert "<ul class='warning'><li>warning: it is noisy</li></ul>" in page
 
-    def test_values_have_their_errors_and_units_or_say_that_they_have_none(self):
+    def test_values_have_errors_and_units_or_are_marked_unknown(self):
         columns = [Column("flux_error", [310.0, np.nan, 25.0, 25.0], "adu"),
                    Column("epoch", [0.0, 1.0, 0.0, 1.0]),
                    Column("ra", np.full(4, 65.4891), "deg")]  # fmt: skip
@@ -248,7 +248,7 @@ class TestCommand:
         for row in rows:
             assert "".join(f"<td>{cell}</td>" for cell in row) in page
 
-    def test_what_was_measured_is_shown_and_nothing_else(self):
+    def test_page_has_sections_for_measured_tables_only(self):
         regions = [Column("name", ["ring"]), Column("x", [4.0], "pix"), Column("flux", [50.0])]
         regions += [Column("error", [3.0]), Column("unit", ["adu"]), Column("note", [""])]
         errors = [Column("name", ["star 1 flux", "jet flux"]), Column("at", [np.nan, 3.0]),

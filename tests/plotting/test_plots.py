@@ -54,7 +54,7 @@ def test_pyplot_is_left_alone():
     assert "matplotlib.pyplot" not in sys.modules
 
 
-def test_without_matplotlib_one_line_says_what_to_install(monkeypatch):
+def test_missing_matplotlib_raises_an_error_with_its_install_command(monkeypatch):
     monkeypatch.setitem(sys.modules, "matplotlib", None)
     with pytest.raises(LnoclError, match=r"pip install matplotlib$"):
         draw_beside(views())

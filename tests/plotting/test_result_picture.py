@@ -45,7 +45,7 @@ def test_a_row_for_the_frame_and_one_for_each_star():
     ]
 
 
-def test_what_is_shown_of_each():
+def test_panels_show_image_model_residuals_and_extended_source():
     view = make_view(p=1)
     (_, image), (_, model), (_, residuals), (_, extended), *zoom = panels(draw_result(view))
     np.testing.assert_array_equal(image.get_array(), view.images[0])
@@ -183,7 +183,7 @@ def test_stars_are_circled_in_image_and_source():
     assert [text.get_text() for text in whole[0].texts] == ["1"]
 
 
-def test_what_errors_of_the_psf_may_fake_is_outlined():
+def test_doubtful_pixels_are_outlined_and_named_in_the_panel_title():
     doubtful = np.zeros((60, 70), bool)
     doubtful[15:25, 5:15] = True
     titles = [title for title, _ in panels(draw_result(make_view(p=1, doubtful=doubtful)))]

@@ -57,7 +57,7 @@ def hostile(claims):
 @pytest.mark.parametrize("compress", [bytes, gzip.compress])
 @pytest.mark.parametrize("use", [read_observation, read_scene, read_saved])
 @pytest.mark.parametrize("claims", CLAIMS.values(), ids=CLAIMS)
-def test_what_a_header_claims_is_not_believed(sound, tmp_path, use, claims, compress):
+def test_false_image_sizes_in_headers_are_refused_at_once(sound, tmp_path, use, claims, compress):
     path = tmp_path / "damaged"
     path.write_bytes(compress(hostile(claims)))
     began = time.monotonic()
@@ -106,7 +106,7 @@ def test_an_image_larger_than_the_memory_is_not_read(sound, tmp_path):
 @pytest.mark.usefixtures("limits")
 @pytest.mark.parametrize("keyword", ["TFIELDS", "NAXIS2", "PCOUNT", "NAXIS"])
 @pytest.mark.parametrize("name", ["star_table.dat", "result.dat"])
-def test_what_a_table_claims_is_not_believed(sound, tmp_path, keyword, name):
+def test_false_table_sizes_in_headers_are_refused(sound, tmp_path, keyword, name):
     content = bytearray(sound[name].read_bytes())
     at = content.index(f"{keyword:8}= ".encode(), content.index(b"XTENSION= 'BINTABLE'"))
     content[at + 10 : at + 30] = f"{BIG:20}".encode()
@@ -170,7 +170,7 @@ def test_rows_that_take_no_room_are_not_read(sound, tmp_path, use, claims, compr
 @pytest.mark.usefixtures("limits")
 @pytest.mark.parametrize("use", [read_observation, read_stars, read_saved, read_checkpoint])
 @pytest.mark.parametrize("path", ["/dev/zero", "pipe"])
-def test_what_may_have_no_end_is_not_read(sound, tmp_path, monkeypatch, use, path):
+def test_device_files_and_pipes_are_refused(sound, tmp_path, monkeypatch, use, path):
     monkeypatch.chdir(tmp_path)
     os.mkfifo("pipe")
     with pytest.raises(FileError) as caught:
@@ -182,7 +182,7 @@ def test_what_may_have_no_end_is_not_read(sound, tmp_path, monkeypatch, use, pat
 
 @pytest.mark.usefixtures("limits")
 @pytest.mark.parametrize("keyword", ["A_ORDER", "BP_ORDER", "WCSAXES"])
-def test_what_coordinates_claim_is_not_believed(keyword):
+def test_wcs_with_excessive_orders_or_axes_is_left_out_with_a_warning(keyword):
     header = fits.Header(SIP | {keyword: 10**5})
     began = time.monotonic()
     with pytest.warns(
@@ -193,7 +193,7 @@ def test_what_coordinates_claim_is_not_believed(keyword):
     assert time.monotonic() - began < 2
 
 
-def test_a_card_that_cannot_be_read_is_left_out_and_said(tmp_path):
+def test_unreadable_card_is_left_out_with_a_warning(tmp_path):
     content = bytearray()
     image(str(tmp_path / "a.fits"))
     content += (tmp_path / "a.fits").read_bytes()
@@ -270,9 +270,7 @@ def test_a_header_without_an_end_is_not_read_for_ever(
 
 @pytest.mark.exhaustive
 @pytest.mark.parametrize("compress", COMPRESS)
-def test_a_compressed_file_of_many_extensions_is_read_and_leaves_none(
-    tmp_path, monkeypatch, compress
-):
+def test_compressed_multi_extension_file_leaves_no_temporary_files(tmp_path, monkeypatch, compress):
     monkeypatch.setattr(packed, "IN_MEMORY", 2**16)  # and so is on the disk
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "temporary"))
     (tmp_path / "temporary").mkdir()
@@ -292,7 +290,7 @@ def test_a_compressed_file_of_many_extensions_is_read_and_leaves_none(
     assert list((tmp_path / "temporary").iterdir()) == []
 
 
-def test_what_would_not_fit_unpacked_is_one_line(tmp_path, monkeypatch):
+def test_compressed_file_too_large_for_the_disk_is_refused(tmp_path, monkeypatch):
     monkeypatch.setattr(packed, "IN_MEMORY", 2**10)
     usage = namedtuple("usage", "free")(2**11)
     monkeypatch.setattr("shutil.disk_usage", lambda folder: usage)
@@ -318,7 +316,7 @@ def test_errors_of_ours_are_not_taken_for_the_file_s(sound, monkeypatch):
         ({"OF": "truth", "NITER": "many"}, "NITER of {} is 'many', not a finite number"),
     ],
 )
-def test_what_should_be_numbers_in_a_header(sound, tmp_path, quick_figures, changes, message):
+def test_non_numeric_header_values_are_refused(sound, tmp_path, quick_figures, changes, message):
     path = tmp_path / "damaged"
     name = f"{changes.get('OF', 'result')}.dat"
     path.write_bytes(sound[name].read_bytes())

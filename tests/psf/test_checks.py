@@ -71,7 +71,7 @@ REFUSED = {
 
 
 @pytest.mark.parametrize("message", REFUSED)
-def test_what_is_refused(message):
+def test_invalid_arguments_are_refused_in_one_line(message):
     with pytest.raises(InputError) as refusal:
         quiet(**({"frame": STAR} | REFUSED[message]))
     assert str(refusal.value).startswith(message)

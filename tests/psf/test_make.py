@@ -22,7 +22,7 @@ def test_a_centred_psf_comes_out_as_it_is(shape):
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-15)
 
 
-def test_pixels_are_kept_as_they_are_where_nothing_is_asked_for():
+def test_pixels_are_unchanged_without_background_shift_or_rotation():
     frame = np.random.default_rng(0).random((20, 30))
     frame[9, 12] = 50.0
     star = make_psf(frame, position=(12, 9), size=11, background=0.0, recentre=False)
@@ -74,7 +74,7 @@ def test_the_frame_given_is_not_changed():
 
 @pytest.mark.exhaustive
 @pytest.mark.parametrize("options", [{"size": 21}, {"background": 40.0}, {"recentre": False}])
-def test_several_angles_share_what_does_not_depend_on_them(options):
+def test_several_angles_share_steps_independent_of_the_angle(options):
     frame = STAR + np.random.default_rng(8).normal(0, 2, STAR.shape)
     frame[28, 31] = np.nan
     stars = make_psfs(frame, [0, 30, 90, -45], clip_negative=True, **options)

@@ -54,7 +54,7 @@ REFUSED = [
 
 
 @pytest.mark.parametrize(("psfs", "n", "message"), REFUSED)
-def test_what_is_refused(psfs, n, message):
+def test_invalid_psfs_and_numbers_of_modes_are_refused(psfs, n, message):
     with pytest.raises(lnocl.InputError, match=message):
         find_modes(psfs, n)
 
@@ -103,6 +103,6 @@ class TestInTheShell:
             (["--modes", "1", "--rotate", "0", "90"], "leave --plot, --rotate and --mask out"),
         ],
     )
-    def test_what_is_refused(self, options, message, capsys):
+    def test_invalid_options_for_modes_are_refused(self, options, message, capsys):
         assert cli.main(["psf", "frames.fits", "--size", "15", "-o", "b.fits", *options]) == 2
         assert message in capsys.readouterr().err

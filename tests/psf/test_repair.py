@@ -106,7 +106,7 @@ def test_large_holes_are_set_to_the_background_and_announced():
     np.testing.assert_array_equal(star.psf == 0, unrepairable[:59, 1:60])
 
 
-def test_what_is_beside_a_large_hole_is_repaired_from_good_pixels_alone():
+def test_pixels_beside_a_large_hole_are_repaired_from_good_pixels_only():
     """A plane is interpolated to rounding, whatever lies beside it."""
     y, x = np.mgrid[:61, :70]
     plane = 500.0 + 3.0 * x - 2.0 * y

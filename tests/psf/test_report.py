@@ -51,13 +51,13 @@ def test_the_unit_does_not_matter(scale):
 
 
 @pytest.mark.parametrize(("psf", "said"), FAULTS.values(), ids=FAULTS)
-def test_faults_are_said(psf, said):
+def test_psf_faults_are_reported(psf, said):
     found = examine(psf).faults()
     assert len(found) == (said is not None)
     assert said is None or said in found[0]
 
 
-def test_noise_is_said_with_what_it_makes_negative():
+def test_noise_is_reported_with_the_negative_pixels_that_it_causes():
     noise = 2e-3 * np.random.default_rng(2).standard_normal(MOFFAT.shape)
     negative, noisy = examine(MOFFAT + noise).faults()
     assert "negative" in negative
@@ -74,6 +74,6 @@ def test_the_smallest_have_a_report_too(shape):
 
 
 @pytest.mark.parametrize("psf", [np.ones((2, 3, 3)), np.zeros((3, 3)), [[np.nan, 1.0]], [1.0], []])
-def test_what_is_refused(psf):
+def test_invalid_psf_is_refused(psf):
     with pytest.raises(InputError, match="must be one image of finite numbers"):
         examine(psf)

@@ -85,7 +85,7 @@ def test_a_rotated_fizeau_psf_is_that_of_the_rotated_baseline(scale, angle, tole
     assert found.flux == pytest.approx(expected.flux, abs=1e-4)
 
 
-def test_what_a_rotation_costs_is_announced():
+def test_sharpness_change_by_a_rotation_is_reported():
     star = quiet(STAR, size=21, rotate=405.0)
     assert line(star, "rotation").startswith("rotation: 45 degrees; its sharpness")
     change = float(line(star, "rotation").split("changed by ")[1].split()[0])

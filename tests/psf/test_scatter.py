@@ -100,7 +100,7 @@ def test_an_observation_has_the_largest_error_of_its_psfs():
     assert not len(exact.psf_scatter)
 
 
-def test_what_no_star_shows_is_a_guess():
+def test_scatter_of_a_pixel_bad_in_all_stars_is_a_guess():
     frame = a_frame(np.random.default_rng(3), 1, 1e5)
     y, x = (round(each) for each in PLACES[0][::-1])
     frame[y + 2, x + 1] = np.nan
@@ -109,6 +109,6 @@ def test_what_no_star_shows_is_a_guess():
     assert made.scatter[at] > 0.8 * GUESSED * made.psf[at] > 5 * np.median(made.scatter)
 
 
-def test_stars_without_noise_have_none():
+def test_stars_without_noise_have_negligible_scatter():
     made = make_psf(1e5 * gaussian(4.0, 70.2, 65.7, SHAPE), size=SIZE, background=0.0)
     assert made.scatter.max() < 1e-3 * made.psf.max()

@@ -78,7 +78,7 @@ def test_the_light_left_out_is_announced_with_its_error():
     assert line(star, "normalised") == f"normalised: flux {star.flux:.6g} set to 1"
 
 
-def test_small_psfs_do_not_tell_what_is_beyond():
+def test_psf_too_small_for_its_wings_is_reported():
     star = make_psf(gaussian(3.0, 32.0, 32.0), size=7, background=0.0)
     assert line(star, "crop") == "crop: 7 x 7 pixels; too few to tell the light beyond"
 

@@ -126,7 +126,7 @@ def test_maps_and_replicas_of_both_are_equal(case):
 
 
 @pytest.mark.filterwarnings("ignore::lnocl.LnoclWarning")
-def test_what_is_of_other_images_or_damaged_or_of_another_version_gives_nothing(case, monkeypatch):
+def test_stored_run_of_other_images_or_version_or_damaged_is_not_used(case, monkeypatch):
     _, given, parts, _ = case
     counts = given.images.copy()
     counts[0, 20, 20] += 1e-9

@@ -183,7 +183,7 @@ def test_read_back_both_plot_as_the_result_does(case):
             np.testing.assert_allclose(python, one, rtol=1e-5, atol=1e-5, err_msg=field.name)
 
 
-def test_what_is_too_large_for_a_table_is_left_out_and_said(monkeypatch, tmp_path, capsys):
+def test_table_too_large_for_the_file_is_left_out_and_reported(monkeypatch, tmp_path, capsys):
     monkeypatch.setattr("lnocl.result.file.MOST_BYTES", 10_000)
     path = str(tmp_path / "large.fits")
     words = ["deconvolve", "image0.fits", "--psf", "psf0.fits", *WORDS, "-o", path]

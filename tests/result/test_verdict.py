@@ -39,7 +39,7 @@ def solve(image, psf, background=LEVEL, **options):
     return result, [str(each.message) for each in warned]
 
 
-def test_a_model_that_fits_is_said_to_and_nobody_is_warned():
+def test_fitting_model_has_a_good_verdict_and_no_warning():
     result, warned = solve(*star(), smoothing=0.1)
     assert result.verdict() == ["the model fits"]
     assert warned == []
@@ -57,7 +57,7 @@ def test_a_run_warns_of_each_fault_of_its_verdict():
     assert not any("refine_psfs" in each for each in warned)
 
 
-def test_a_star_without_light_is_said_to_have_none():
+def test_star_without_light_is_reported():
     """Iterations that multiply leave 1e-63 of it."""
     image, psf = star(flux=0.0)
     image[STAR[1] - 3 : STAR[1] + 4, STAR[0] - 3 : STAR[0] + 4] = 0.0

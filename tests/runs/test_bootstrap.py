@@ -185,7 +185,7 @@ def run_bootstrap(outcome, n, **changes):
     return bootstrap.bootstrap(outcome, n, APERTURES, 7, **changes)
 
 
-def test_stated_errors_of_stars_are_those_of_what_is_round_them():
+def test_star_flux_errors_include_stated_errors_and_regions_their_share():
     flux, light = Quantity("star 1 flux", "flux", 100.0), Quantity("a", "flux", 50.0)
     errors = np.tile([[-3.0, -4.0], [3.0, 4.0]], (5, 1))
     alone = Bootstrap((flux, light), errors, errors[:0], np.zeros((3, 8, 8)), 2.0, 0)
@@ -199,7 +199,7 @@ def test_stated_errors_of_stars_are_those_of_what_is_round_them():
     np.testing.assert_array_equal(less.standard_errors, alone.standard_errors)
 
 
-def test_errors_of_light_are_as_large_as_what_smoothing_changes():
+def test_light_errors_are_at_least_the_change_by_smoothing():
     star, sharp, broad = (Quantity(name, "flux", 100.0) for name in ("star 1 flux", "a", "b"))
     errors = np.tile([[-1.0, -4.0, -4.0], [3.0, 2.0, 2.0]], (5, 1))  # of bias 1, -1 and -1
     changes = np.array([0.0, 50.0, 0.5])
@@ -410,7 +410,7 @@ def test_regions_whose_errors_may_not_hold_are_named():
 
 @pytest.mark.exhaustive
 @pytest.mark.filterwarnings("ignore:the PSFs do not fit")
-def test_errors_of_psfs_are_told_apart():
+def test_psf_part_of_errors_is_separate_and_scales_with_the_scatter():
     """Twice the scatter gives twice their part, and leaves the rest; without it there is none."""
     made = BASE.make()
     scatter = 1e-4 * made.psfs / made.psfs.sum(axis=(1, 2), keepdims=True)
@@ -481,13 +481,13 @@ def test_rates_are_called_rates():
         ({"n": 10, "seed": -1}, "^seed must be a whole number, 0 or more; -1 was given"),
     ],
 )
-def test_numbers_that_are_none_are_refused(options, message):
+def test_invalid_numbers_of_replicas_and_seeds_are_refused(options, message):
     with pytest.raises(lnocl.InputError, match=message):
         solved().bootstrap(**options)
 
 
 @pytest.mark.parametrize("level", [0.0, 1.0, 95])
-def test_a_level_that_is_none_is_refused(level):
+def test_invalid_interval_level_is_refused(level):
     with pytest.raises(lnocl.InputError, match=r"^the level of an interval lies between 0"):
         made_up([1.0, 2.0, 4.0]).interval(level)
 

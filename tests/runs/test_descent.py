@@ -149,7 +149,7 @@ class TestDescent:
         self.check(1.0, 1e-9, *[1e-8] * 100)
 
     @pytest.mark.parametrize("value", [np.inf, np.nan])
-    def test_what_is_not_finite_is_refused(self, value):
+    def test_non_finite_objective_is_refused(self, value):
         with pytest.raises(NotFiniteError):
             self.check(1.0, value)
 
@@ -173,7 +173,7 @@ EXPLAINED = [
 
 
 @pytest.mark.parametrize(("psf", "expected"), EXPLAINED)
-def test_what_the_psfs_show_is_named(psf, expected):
+def test_warning_names_the_psf_feature_that_explains_the_rise(psf, expected):
     assert expected in explain(psf)
 
 

@@ -168,7 +168,7 @@ DONE = {
 }
 
 
-def test_the_page_of_what_goes_together_has_the_table():
+def test_documentation_table_lists_every_kind_of_scene():
     lines = (ROOT / "docs/guide/together.md").read_text().splitlines()
     rows = [line.strip("| ").split(" | ") for line in lines if line.startswith("| ")]
     header, _, *rows = rows[: len(KINDS) + 2]

@@ -261,7 +261,7 @@ class TestSpeckles:
         assert not len(right.bootstrap(10, regions=[circle]).of_psfs)
 
     @pytest.mark.exhaustive
-    def test_it_is_said(self):
+    def test_misfit_from_speckles_is_reported(self):
         means = FLUX * np.roll(self.TRUE, (-8, -2), (0, 1)) + LEVEL
         counts = np.random.default_rng(3).poisson(means)
         observation = lnocl.Observation(counts, PSF, background=LEVEL, psf_centre="given")

@@ -87,7 +87,7 @@ class TestExposures:
         plan = lnocl.plan(dimmed(halos=[halo]), [STAR])
         assert plan.why_not(EXPOSURES) == "halos may be as bright beside stars"
 
-    def test_what_is_found_comes_back_from_a_result(self):
+    def test_fitted_exposures_are_restored_from_a_result(self):
         given = dimmed(exposure=[2.0, 2.0, 2.0])
         result = lnocl.deconvolve(given, [STAR], engine="numpy", n_iter=5, stop=None)
         outcome = result._outcome
@@ -107,7 +107,7 @@ class TestRays:
         return image, rays
 
     @pytest.mark.parametrize("oversample", [1, 2])
-    def test_they_are_masked_and_told_image_by_image(self, oversample):
+    def test_cosmic_rays_are_masked_and_reported_by_image(self, oversample):
         image, rays = self.image()
         psf = PSF if oversample == 1 else np.repeat(np.repeat(PSF, 2, 0), 2, 1)
         given = lnocl.Observation([image, image + rays], psf, background=LEVEL,
@@ -138,13 +138,13 @@ class TestRays:
         assert abs(flux - 3e4) < 3.0 * error < 1e3
         assert result.verdict() == ["the model fits"]
 
-    def test_stars_sharper_than_a_wrong_psf_are_none(self):
+    def test_stars_sharper_than_a_wrong_psf_are_not_cosmic_rays(self):
         image, _ = self.image()
         y, x = np.indices((41, 41)) - 20
         given = lnocl.Observation(image, np.exp(-(x**2 + y**2) / 1e3), background=LEVEL)
         assert not prepare(lnocl.plan(given, [STAR], engine="numpy", refine_psfs=())).found[RAYS]
 
-    def test_noise_beyond_that_of_counts_is_none(self):
+    def test_noise_above_that_of_counts_is_not_cosmic_rays(self):
         """As in images whose unit is not electrons."""
         counts = np.random.default_rng(3).normal(LEVEL, 5.0 * LEVEL**0.5, (64, 64))
         given = lnocl.Observation(counts.clip(0.0), PSF, background=LEVEL)

@@ -119,7 +119,7 @@ def test_families_that_are_named_are_judged_whatever_the_smoothing():
     assert plan.why_not(STARS) == "`smoothing` is a number"
 
 
-def test_what_hangs_on_psfs_is_said_where_they_are_judged():
+def test_plan_names_steps_conditional_on_psfs_only_where_these_are_judged():
     judged, not_judged = lnocl.plan(observe(), STAR), lnocl.plan(observe(), STAR, smoothing=0.1)
     assert f"{CHOICE}: yes, unless PSFs are wrong" in str(judged)
     assert f"{CHOICE}: yes\n" in str(not_judged)

@@ -99,7 +99,7 @@ def test_the_extended_source_gains_by_it(wide):
 
 
 @pytest.mark.exhaustive
-def test_it_is_said_in_one_line(caplog):
+def test_fit_of_psfs_is_reported_in_one_line(caplog):
     caplog.set_level("INFO", "lnocl")
     solve(1.05, n_iter=5, stop=None)
     [line] = [each for each in caplog.messages if "PSFs fitted to the stars" in each]
@@ -116,7 +116,7 @@ def test_exact_psfs_stay_and_errors_hold_no_part_of_theirs(wide):
 
 
 @pytest.mark.exhaustive
-def test_errors_grow_with_what_psfs_may_have():
+def test_flux_errors_increase_with_the_psf_error():
     errors = [
         solve(1.0, error, refine_psfs=(), n_iter=30, stop=None).star_flux_errors.item()
         for error in (0.0, 0.01, 0.03, 0.1)
@@ -127,7 +127,7 @@ def test_errors_grow_with_what_psfs_may_have():
 
 @pytest.mark.exhaustive
 @pytest.mark.parametrize(("error", "share"), [(0.0, 0.2), (0.03, 0.0)])
-def test_an_error_that_is_left_counts_in_fluxes_where_psfs_are_said_to_be_exact(error, share):
+def test_remaining_psf_error_enters_flux_errors_only_where_psfs_are_exact(error, share):
     found = solve(1.0, error, refine_psfs=(), n_iter=5, stop=None)._outcome
     none = np.zeros(0)
     left = PsfRefinement((), np.zeros((2, 0)), (1.0, 1.0), False, 0.2, none, none, none)
@@ -233,7 +233,7 @@ def test_stars_are_moved_that_lie_off_where_psfs_are_fitted(shift):
 @pytest.mark.exhaustive
 @pytest.mark.filterwarnings("ignore:the PSFs do not fit")
 @pytest.mark.parametrize(("error", "is_within"), [(0.02, False), (0.05, True)])
-def test_jitter_and_pixels_are_fitted_and_fluxes_not_marginal_beyond_what_is_held(error, is_within):
+def test_misfit_beyond_the_psf_error_fits_parameters_and_raises_the_error(error, is_within):
     """PSFs with three lobes that those of the images lack: off by 8 %."""
     kernel = psf(TRUE[0])
     y, x = np.indices(kernel.shape) - 20

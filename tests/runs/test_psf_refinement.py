@@ -120,7 +120,7 @@ def test_right_psfs_are_left_as_they_are(contrast):
 
 
 @pytest.mark.exhaustive
-def test_what_parameters_cannot_mend_is_left_and_said(caplog):
+def test_psfs_are_unchanged_where_parameters_cannot_reduce_the_misfit(caplog):
     speckles = 0.3 * np.random.default_rng(2).standard_normal((N, N))
     true = PSF * np.exp(np.fft.ifft2(np.fft.fft2(speckles) * np.fft.fft2(IDEAL)).real * 8)
     caplog.set_level("INFO", "lnocl")
@@ -343,7 +343,7 @@ REFUSED = [
 
 
 @pytest.mark.parametrize(("options", "message"), REFUSED)
-def test_what_is_refused(options, message):
+def test_invalid_refinements_are_refused(options, message):
     with pytest.raises(lnocl.InputError, match=message):
         refine(images_through([PSF]), PSF, **options)
 
@@ -452,7 +452,7 @@ class TestAScatterThatIsGiven:
 
 @pytest.mark.exhaustive
 @pytest.mark.parametrize("exposure", [1.0, 40.0])
-def test_what_may_be_faked_is_the_share_of_the_light_in_the_sky(exposure):
+def test_spurious_light_limit_is_the_psf_error_times_the_stellar_light(exposure):
     true = TestAnErrorThatIsLeft.TRUE
     images = images_through([true, true], 8.0)
     observation = lnocl.Observation(
@@ -637,7 +637,7 @@ def test_where_psfs_give_nothing_their_error_is_no_noise():
 
 
 @pytest.mark.parametrize("given", ["ideal_psfs", "pupils", "psf_modes"])
-def test_what_could_refine_psfs_and_does_not_is_named(given, caplog):
+def test_unused_inputs_for_psf_refinement_are_reported(given, caplog):
     caplog.set_level("INFO", "lnocl")
     value = PSF[None] if given == "psf_modes" else PSF
     observation = lnocl.Observation(np.ones((N, N)), PSF, **{given: value})

@@ -24,7 +24,7 @@ def errors_of(run):
     return run.outcome("n_iter").star_errors()
 
 
-def test_errors_of_stars_that_have_come_to_one_place_are_nan_and_said():
+def test_coincident_stars_have_nan_errors_and_a_warning():
     observation = lnocl.Observation(np.full((32, 32), 9.0), PSF)
     run = run_of(observation, [(8.0, 9.0), (8.5, 9.0), (23.0, 22.0)])
     errors_of(run)

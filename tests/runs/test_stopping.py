@@ -180,7 +180,7 @@ class TestHalves:
             (1e20, "1e\\+20 electrons is too bright to be split"),
         ],
     )
-    def test_refuse_what_cannot_be_dealt_out(self, value, message):
+    def test_counts_that_cannot_be_split_are_refused(self, value, message):
         observation = lnocl.Observation(np.full((4, 4), value), np.ones((1, 1)))
         with pytest.raises(lnocl.InputError, match=message):
             split_counts(observation)
@@ -432,7 +432,7 @@ class TestSmoothing:
         assert len(result.history) == result.n_iter + 1
         assert (np.diff(result.history["objective"][: starts[0]]) < 0).all()
 
-    def test_after_too_many_iterations_it_is_better_than_none(self):
+    def test_smoothing_reduces_the_error_after_too_many_iterations(self):
         observation, _, truth = scene()
         result = run(observation, smoothing="auto", n_iter=150)
         assert error(result, truth) < 0.8 * error(run(observation, n_iter=150), truth)

@@ -300,7 +300,7 @@ def test_errors_of_the_pixels_of_psfs(kind):
     ("kind", "allowed"),
     [("moved", 3e-3), ("finer", 2e-4), ("dimmed, finer", 2e-4), ("turned", 2e-2)],
 )
-def test_what_the_psfs_of_a_fit_are_convolved_with(kind, allowed):
+def test_sky_convolved_with_the_given_psfs_reproduces_the_model(kind, allowed):
     """Through the PSFs as they were given it is the model, but for how these are shifted."""
     scene = a_scene(kind)
     model, fluxes = Model(scene), np.array([400.0, 70.0])

@@ -14,7 +14,7 @@ def test_whole_numbers_from_the_least_on_are_taken(value):
 
 
 @pytest.mark.parametrize("value", [2, -7, 7.0, "7", None, True, np.True_, np.array([7]), np.nan])
-def test_others_are_refused_with_what_they_may_be(value):
+def test_invalid_whole_numbers_are_refused_with_the_valid_range(value):
     with pytest.raises(InputError) as caught:
         whole("size", value, 1 if value is True else 3, ", or auto")
     least = 1 if value is True else 3

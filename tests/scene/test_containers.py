@@ -209,7 +209,7 @@ class TestUncertainties:
         np.testing.assert_array_equal(image.uncertainty.array, given)
 
 
-def test_uncertainties_below_the_noise_of_the_counts_leave_none():
+def test_uncertainties_below_the_photon_noise_give_no_read_noise():
     variance = np.where(IMAGES == 9, 0.9 * IMAGES, VARIANCE)
     image = NDData(IMAGES, uncertainty=VarianceUncertainty(variance))
     assert_nearly_same(observe(images=image), observe(read_noise=READ_NOISE * (IMAGES != 9)))

@@ -69,7 +69,7 @@ def test_rays_are_found_and_nothing_else(name, seed):
 
 
 @pytest.mark.parametrize("name", PSFS)
-def test_right_scenes_have_none_where_the_psf_is_a_fifth_too_wide(name):
+def test_psf_a_fifth_too_wide_gives_no_cosmic_rays(name):
     """Sources are sharper than that makes them."""
     for seed in range(4):
         light, chance = sky(PSFS[name], seed)
@@ -81,12 +81,12 @@ def test_right_scenes_have_none_where_the_psf_is_a_fifth_too_wide(name):
 
 @pytest.mark.parametrize("level", [0.003, 0.1, 3.0, 1e3])
 @pytest.mark.parametrize("name", PSFS)
-def test_noise_has_none_in_a_hundred_thousand_pixels(name, level):
+def test_noise_gives_at_most_one_cosmic_ray_in_many_pixels(name, level):
     images = np.random.default_rng(7).poisson(level, (15, *SHAPE)).astype(float)
     assert sum(find(image, PSFS[name], level).sum() for image in images) <= 1
 
 
-def test_rings_of_a_star_behind_bad_pixels_are_none():
+def test_diffraction_rings_around_bad_pixels_are_not_cosmic_rays():
     light = LEVEL + 1e6 * airy(40.3, 41.8, SHAPE)
     y, x = np.indices(SHAPE)
     mask = np.hypot(x - 40.3, y - 41.8) < 3.0

@@ -187,7 +187,7 @@ def test_images_whose_sky_is_too_large_are_refused():
 
 @pytest.mark.parametrize("q", [2, 4])
 @pytest.mark.parametrize("sigma", [0.4, 1.0])
-def test_the_resolution_is_that_of_what_pixels_see(q, sigma):
+def test_resolution_is_equal_for_optical_and_effective_psfs(q, sigma):
     """One instrument, its PSF given either way."""
     places = (np.arange(2 * 8 * q + 1) / q) - 8
     along = (erf((places + 0.5) / sigma / 2**0.5) - erf((places - 0.5) / sigma / 2**0.5)) / 2
@@ -200,7 +200,7 @@ def test_the_resolution_is_that_of_what_pixels_see(q, sigma):
     assert widths[0] == pytest.approx(widths[1], rel=1e-3)
 
 
-def test_the_weight_of_a_star_is_what_its_samples_sum_to():
+def test_star_weight_equals_the_sum_of_its_samples():
     psf = fine_gaussian(2, 0.5, 3)  # its samples a pixel apart sum to another number
     observation = lnocl.Observation(np.ones((16, 16)), psf, oversample=2, effective_psfs=True)
     scene = Scene(observation, [(7.2, 8.4)])
@@ -210,6 +210,6 @@ def test_the_weight_of_a_star_is_what_its_samples_sum_to():
 
 
 @pytest.mark.parametrize("given", [1, "yes", None])
-def test_what_psfs_hold_is_true_or_false(given):
+def test_effective_psfs_must_be_a_boolean(given):
     with pytest.raises(lnocl.InputError, match="effective_psfs must be True or False"):
         lnocl.Observation(np.ones((8, 8)), np.ones((3, 3)), effective_psfs=given)

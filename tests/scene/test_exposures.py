@@ -100,7 +100,7 @@ def test_tiles_are_smoothed_by_one_weight_where_exposures_differ_between_them():
 
 
 @numpy_first
-def test_equal_exposures_are_none(engine):
+def test_equal_exposures_equal_no_exposures(engine):
     made = dataclasses.replace(EACH, exposure="none").make()
     result = made.deconvolve(n_iter=10, **engine)
     for exposure in (1.0, [1.0, 1.0, 1.0]):
@@ -119,7 +119,7 @@ def test_equal_exposures_are_none(engine):
 @pytest.mark.exhaustive
 @pytest.mark.parametrize("start", ["given", "default"])
 @every_engine
-def test_what_saw_nothing_has_no_influence(engine, start):
+def test_masked_and_unexposed_pixels_have_no_influence(engine, start):
     made = MAP.make()
     starts = {} if start == "given" else {"initial_extended": None, "initial_star_fluxes": None}
     result = made.deconvolve(n_iter=10, **starts, **engine)
@@ -217,7 +217,7 @@ def test_exposures_whose_square_is_no_number_are_taken():
     assert result.mu == result.smoothing == 0.0
 
 
-def test_mu_too_large_is_refused_in_terms_of_what_was_given():
+def test_mu_too_large_is_refused_with_the_largest_valid_value():
     made = EACH.make()
     observation = made.observation(exposure=made.exposure * 1e6)
     with pytest.raises(lnocl.InputError, match=r"mu 1e.40 is too large") as caught:

@@ -34,7 +34,7 @@ def test_a_new_field_is_turned_upright(observation):
     np.testing.assert_array_equal(turned, RAMP)
 
 
-def test_a_new_field_is_kept_and_read_again_with_another_mask(observation):
+def test_new_field_survives_replacement_and_follows_the_mask(observation):
     other = observation.replace(background=[1.0, 2.0])
     assert other.dimming is observation.dimming
     bad = RAMP > 100

@@ -98,7 +98,7 @@ def test_residuals_are_in_standard_deviations(known):
     np.testing.assert_allclose(residuals[~bad], expected[~bad], rtol=1e-12, atol=1e-12)
 
 
-def test_there_is_none_where_nothing_is_modelled(monkeypatch):
+def test_residuals_are_nan_where_the_model_is_zero(monkeypatch):
     _, result = solve()
     models = result.models()
     models[0, 2, 3] = 0.0

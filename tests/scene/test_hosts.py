@@ -25,7 +25,7 @@ def test_a_host_has_the_light_that_it_has_round_the_star():
 
 
 @pytest.mark.parametrize("sky", [JET, RING, np.ones((N, N)), np.zeros((N, N))])
-def test_what_is_on_one_side_or_does_not_fall_is_none(sky):
+def test_one_sided_annular_and_flat_light_is_no_host(sky):
     assert host(sky) < 1e-3 * host(HOST)
 
 

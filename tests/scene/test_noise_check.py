@@ -32,13 +32,13 @@ def drizzled(image):
 
 
 @pytest.mark.parametrize("level", [0.5, 60.0, 5e4])
-def test_nothing_is_said_of_counts(level):
+def test_poisson_noise_gives_no_warning(level):
     heard = {seed: said(counts(seed, level), background=level) for seed in range(20)}
     assert not any(heard.values()), heard
 
 
 @pytest.mark.parametrize("level", [1e-4, 2.5e-3, 0.02, 0.1])
-def test_nothing_is_said_of_few_counts(level):
+def test_poisson_noise_of_few_counts_gives_no_warning(level):
     """As of X-rays, where most blocks are empty."""
     for seed in range(20):
         image = np.random.default_rng(seed).poisson(level, SHAPE).astype(float)
@@ -57,12 +57,12 @@ def test_of_large_images_some_rows_of_blocks_say_the_same(rows):
     assert len(_some_rows(image[: rows - rows % 8])) // 8 in range(128, 256)
 
 
-def test_nothing_is_said_of_counts_with_read_noise():
+def test_poisson_and_read_noise_give_no_warning():
     image = counts() + np.random.default_rng(1).normal(0.0, 12.0, SHAPE)
     assert said(image, read_noise=12.0) == []
 
 
-def test_nothing_is_said_of_bright_structure():
+def test_bright_structure_gives_no_warning():
     """The fringes of a star in all of the image."""
     image = np.random.default_rng(3).poisson(5e4 * (2.0 + np.sin(X / 2.0) * np.cos(Y / 3.0)))
     assert said(image.astype(float)) == []
@@ -79,14 +79,14 @@ WRONG = {
 
 
 @pytest.mark.parametrize("case", WRONG)
-def test_other_noise_is_said(case):
+def test_noise_other_than_poisson_gives_a_warning(case):
     (message,) = said(np.array([counts(5), WRONG[case]]))
     assert message.startswith("the noise of image 1 is not that of its counts: where it is darkest")
     assert "see to gain, background" in message
 
 
 @pytest.mark.parametrize("n", [40, 128])
-def test_read_noise_that_is_too_large_is_said_and_taken_back(n):
+def test_excessive_read_noise_gives_a_warning_and_is_corrected(n):
     image = (counts() + np.random.default_rng(1).normal(0.0, 12.0, SHAPE))[:n, :n]
     (message,) = said(image, background=LEVEL, read_noise=24.0)
     assert message.startswith("the noise of image 0 is not that of its counts")
@@ -101,7 +101,7 @@ def test_read_noise_that_is_too_large_is_said_and_taken_back(n):
 
 
 @pytest.mark.parametrize("times", [1, 2])
-def test_nothing_is_said_of_noise_that_neighbours_share(times):
+def test_correlated_noise_gives_no_warning(times):
     image = counts()
     for _ in range(times):
         image = drizzled(image)
@@ -109,7 +109,7 @@ def test_nothing_is_said_of_noise_that_neighbours_share(times):
 
 
 @pytest.mark.parametrize("level", [5.0, 60.0, 5e4])
-def test_a_background_that_is_too_high_is_said(level):
+def test_background_too_high_gives_a_warning(level):
     high = level + 0.6 * np.sqrt(level)
     (message,) = said(np.array([counts(3, level)] * 2), background=[level, high])
     assert message.startswith("the background of image 1 is too high: it is ")

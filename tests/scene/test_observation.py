@@ -226,7 +226,7 @@ def assert_refused(message, **changes):
 
 
 @pytest.mark.parametrize("name", ["images", *GIVEN])
-def test_what_is_no_array_of_real_numbers_is_refused(name):
+def test_arrays_other_than_real_numbers_are_refused(name):
     for given in (np.array([["1"]]), np.array([[1j]]), np.array([[None]])):
         holds = "is of type" if name == "mask" else "holds"
         assert_refused(f"{name} {holds} {given.dtype}", **{name: given})
@@ -423,7 +423,7 @@ def test_negative_counts_are_set_to_zero_and_counted(read_noise, count):
     np.testing.assert_array_equal(observation.images, expected)
 
 
-def test_counts_that_read_noise_lifts_above_zero_are_kept_in_silence():
+def test_counts_raised_above_zero_by_read_noise_give_no_warning():
     observation, messages, _ = announced(images=np.full((4, 4), -1.0), read_noise=1.5)
     assert messages == []
     np.testing.assert_array_equal(observation.images, np.full((1, 4, 4), 1.25))
@@ -454,7 +454,7 @@ def test_without_more_there_is_no_background_and_an_exposure_of_one():
     assert observation.exposure.tolist() == [1.0] * 3
 
 
-def test_one_pixel_is_said_to_be_one():
+def test_single_pixels_are_announced_in_the_singular():
     images = np.where(IMAGES == 7, np.nan, np.where(IMAGES == 9, -1.0, IMAGES))
     _, messages, _ = announced(images=images, psfs=np.where(PSF == 2, -0.8, PSF))
     assert messages[0] == "1 image pixel is not finite and was masked"
@@ -470,7 +470,7 @@ def test_few_negative_psf_pixels_are_noted_but_not_warned_of(caplog):
     assert f"kept: {100 * share:.2g} % of the light of a PSF at most" in caplog.text
 
 
-def test_negative_psf_pixels_are_kept_and_counted():
+def test_negative_psf_pixels_are_preserved_and_counted():
     psfs = np.array([PSF, PSF, PSF])
     psfs[1:, 0, 0] = -0.8
     observation, messages, files = announced(psfs=psfs)
@@ -580,7 +580,7 @@ def test_replace_keeps_one_psf_for_all_images_in_one():
     assert pickle.loads(pickle.dumps(other)).psfs.shape == (2, 3, 3)
 
 
-def test_replace_of_psfs_of_another_shape_takes_what_goes_with_them():
+def test_replacing_psfs_by_another_shape_requires_their_related_arrays():
     given = two_images(psf_scatter=np.ones((3, 3)), pupils=np.ones((3, 3)))
     with pytest.raises(InputError, match=r"^pupils has shape \(2, 3, 3\); give \(5, 5\), the"):
         given.replace(psfs=np.ones((2, 5, 5)))
@@ -666,7 +666,7 @@ def error_of(make, **changes):
 
 
 @pytest.mark.parametrize("name", WRONG)
-def test_replace_refuses_what_an_observation_does_with_the_same_words(name):
+def test_replace_gives_the_same_errors_as_a_new_observation(name):
     given = {"images": np.full((2, 8, 9), 5.0), "psfs": np.ones((3, 3)), "background": [1.0, 2.0]}
     observation = lnocl.Observation(**given)
     for values in WRONG[name]:
@@ -712,7 +712,7 @@ def made(make, **given):
 
 @pytest.mark.parametrize("name", RIGHT)
 @pytest.mark.parametrize("before", [None, *RIGHT])
-def test_replace_makes_what_an_observation_of_these_is(name, before):
+def test_replace_equals_a_new_observation(name, before):
     given = {"images": np.full((2, 8, 9), 5.0), "psfs": np.ones((2, 3, 3))}
     if before:
         given[before] = RIGHT[before]
@@ -753,7 +753,7 @@ def test_replace_makes_what_an_observation_of_these_is(name, before):
         ),
     ],
 )
-def test_replace_refuses_what_does_not_go_with_the_rest(known, changes, message):
+def test_replace_refuses_unknown_names_and_inconsistent_changes(known, changes, message):
     observation = lnocl.Observation(np.full((2, 8, 9), 5.0), np.ones((3, 3)), **known)
     assert message in error_of(observation.replace, **changes)
 
@@ -905,7 +905,7 @@ def test_attributes_cannot_be_set():
         observation.psfs = np.ones((2, 3, 3))
 
 
-def test_images_with_an_uncertainty_replace_none_of_any_shape():
+def test_replace_refuses_images_with_an_uncertainty_of_any_shape():
     given = lnocl.Observation(np.ones((3, 12, 14)), np.ones((3, 3)))
     for shape in ((12, 14), (12, 12)):
         errors = StdDevUncertainty(np.full(shape, 2.0))

@@ -42,7 +42,7 @@ def test_light_beyond_is_that_of_the_function(shape, beta):
 @pytest.mark.parametrize("shape", SHAPES)
 @pytest.mark.parametrize("beta", [1.5, 2.0, 3.0])
 @pytest.mark.parametrize("level", [0.05, -0.01])
-def test_a_level_is_told_from_wings(shape, beta, level):
+def test_constant_level_is_distinguished_from_wings(shape, beta, level):
     psf = moffat(shape, beta)
     beyond = 1.0 - psf.sum()
     psf *= (1.0 - level) / psf.sum()
@@ -133,7 +133,7 @@ def test_errors_hold_the_truth_of_noisy_psfs(beta):
     assert ((rms > 0.3) & (rms < 1.4)).all()
 
 
-def test_what_has_no_rings_tells_nothing():
+def test_psf_without_complete_rings_has_no_edge_light_or_level():
     point = np.zeros((15, 15))
     point[7, 7] = 3.0
     for psf in (point, point[7:8, 7:8], moffat((7, 30), 2.0)):

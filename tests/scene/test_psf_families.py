@@ -125,7 +125,7 @@ def test_the_spectrum_of_a_small_psf_is_that_of_it_laid_on_the_grid():
     np.testing.assert_allclose(spectrum(small, (16, 20)), np.fft.rfft2(laid), rtol=0, atol=1e-15)
 
 
-def test_psfs_of_no_light_are_told():
+def test_only_psfs_with_positive_light_are_possible():
     found = families("jitter")
     assert found.are_possible(with_values(found, [0.5, 0.1, 0.2]))
     assert found.are_possible(with_values(found, [-0.5, 0.0, -0.5]))
@@ -148,7 +148,7 @@ def test_a_common_shift_is_taken_out():
 
 
 @pytest.mark.parametrize("angles", [(0.0, 0.0, 0.0), (20.0, 70.0, 200.0)])
-def test_what_a_shift_of_the_sky_does_to_turned_images_is_none_of_their_psfs(angles):
+def test_common_shift_of_the_sky_is_removed_from_psfs_of_rotated_images(angles):
     """The mean along the images' axes was taken for it, and moved stars where they are not."""
     maps = lnocl.rotations(angles, (7.5, 7.5))
     observation = lnocl.Observation(np.ones((3, 16, 16)), np.ones((5, 5)), transforms=maps)

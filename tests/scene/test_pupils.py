@@ -93,7 +93,7 @@ REFUSED = [
 
 
 @pytest.mark.parametrize(("changed", "message"), REFUSED)
-def test_what_is_refused(changed, message):
+def test_invalid_pupil_parameters_are_refused(changed, message):
     given = {"shape": (N, N), "wavelength": 1 * u.um, "pixel_scale": 10 * u.mas}
     with pytest.raises(lnocl.InputError, match=message):
         circular_pupil(**given | {"diameter": 8 * u.m} | changed)

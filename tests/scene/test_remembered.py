@@ -44,7 +44,7 @@ def test_an_answer_cannot_be_written_to():
         double(np.ones(3))[0] = 5.0
 
 
-def test_the_oldest_answers_go_where_all_are_larger_than_is_kept():
+def test_oldest_results_are_dropped_from_a_full_cache():
     double, asked = counted(2 * (LEAST + 8 * 1000) + 1)
     one, two, three = (np.full(1000, float(k)) for k in range(3))
     double(one)
@@ -60,7 +60,7 @@ def test_the_oldest_answers_go_where_all_are_larger_than_is_kept():
     assert len(asked) == 6
 
 
-def test_objects_are_told_apart_by_their_contents():
+def test_cached_objects_are_compared_by_their_contents():
     asked = []
 
     @remembered(2**20)
@@ -74,7 +74,7 @@ def test_objects_are_told_apart_by_their_contents():
     assert len(asked) == 3
 
 
-def test_threads_get_the_answers_of_what_they_ask():
+def test_cache_returns_correct_results_in_several_threads():
     double, _ = counted(4 * LEAST)
     wrong = []
 

@@ -299,7 +299,7 @@ def test_values_of_another_kind_are_refused(name):
         *([1, 2, 3, 4], [("a", "b")], "3,4", [(1j, 2)], np.array([[1j, 2]]), 5),
     ],
 )
-def test_what_are_no_stars_is_refused(stars):
+def test_invalid_stars_are_refused(stars):
     with pytest.raises(lnocl.InputError, match="star"):
         paper(OBSERVATION, stars, n_iter=1, engine="numpy")
 
@@ -417,7 +417,7 @@ def test_psf_that_rings_between_pixels_is_warned_of(fwhm, off, given, warned):
     assert [str(w.message).startswith(str(warned)) for w in caught] == [True] * (warned is not None)
 
 
-def test_what_the_warning_says_of_the_ringing_is_so():
+def test_warning_states_the_ringing_of_a_shifted_star():
     observation = lnocl.Observation(np.ones((48, 48)), gaussian(1.5, off=0.5))
     with pytest.warns(lnocl.LnoclWarning, match="it rings by 4.7% of its peak"):
         scene = Scene(observation, [(20.5, 21.5)])

@@ -146,7 +146,7 @@ def test_gaussians_go_where_they_are_put(shape, fwhm):
         (airy, 2.8, 4e-7, 1e-5),
     ],
 )
-def test_errors_are_what_the_docstring_says(make, width, error, darkest):
+def test_shift_errors_match_the_documented_values(make, width, error, darkest):
     """In the middle; what of the wings the PSF's edges have cut off is not found by moving it."""
     psf, n = make(61, width), 61
     found = place(psf, (128, 128), 64.5, 64.5).on_grid((128, 128))
@@ -173,7 +173,7 @@ def test_whole_pixels_more_roll_the_grid(shape, x, y, dx, dy):
 
 
 @given(shape=st.tuples(sizes, sizes), grid=st.tuples(sizes, sizes), x=positions, y=positions)
-def test_the_sum_is_kept(shape, grid, x, y):
+def test_shift_conserves_the_sum(shape, grid, x, y):
     psf = make_psfs(1, shape)[0]
     total = place(psf, grid, x, y).values.sum()
     assert total == pytest.approx(psf.sum(), rel=2e-15)  # measured 6e-16
@@ -208,7 +208,7 @@ class TestDerivative:
     @pytest.mark.parametrize("grid", [(128, 128), (32, 64), (31, 63)])
     @pytest.mark.parametrize("axis", [0, 1])
     @pytest.mark.parametrize(("x", "y"), [(12.0, 17.0), (12.3, 16.6), (12.45, 17.0)])
-    def test_is_that_of_what_is_placed(self, grid, axis, x, y):
+    def test_derivative_matches_finite_differences(self, grid, axis, x, y):
         """Of any PSF, sharp ones too: the difference of what `place` returns itself."""
         psf, h = make_psfs(1, (6, 7))[0], 1e-3
         expected = 0.0

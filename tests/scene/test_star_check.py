@@ -43,11 +43,11 @@ def said(observation, star=STAR, moves=False):
 
 @pytest.mark.parametrize("seed", range(10))
 @pytest.mark.parametrize("flux", [2e3, 1e5, 1e7])
-def test_nothing_is_said_of_a_psf_that_fits(seed, flux):
+def test_right_psf_gives_no_warning(seed, flux):
     assert said(observe(moffat(WIDTH), flux, seed=seed)) == []
 
 
-def test_a_masked_star_is_said():
+def test_masked_star_gives_a_warning():
     mask = np.zeros((SIZE, SIZE), bool)
     mask[STAR[1] - 2 : STAR[1] + 3, STAR[0] - 2 : STAR[0] + 3] = True
     observation = observe(moffat(WIDTH), mask=mask)
@@ -63,7 +63,7 @@ def test_a_masked_star_is_said():
 
 
 @pytest.mark.parametrize("factor", [0.5, 0.8, 1.2, 1.35, 2.0, 5.0])
-def test_a_psf_of_another_width_is_said(factor):
+def test_psf_of_another_width_gives_a_warning(factor):
     (message,) = said(observe(moffat(factor * WIDTH)))
     stated = float(message.split(" times as wide")[0].rsplit(" ", 1)[1])
     assert stated == pytest.approx(factor, rel=0.05)
@@ -71,7 +71,7 @@ def test_a_psf_of_another_width_is_said(factor):
 
 
 @pytest.mark.parametrize("offset", [0.3, 1.0])
-def test_a_star_elsewhere_is_said(offset):
+def test_misplaced_star_gives_a_warning(offset):
     observation = observe(moffat(WIDTH), star=(STAR[0] + offset, STAR[1]))
     (message,) = said(observation)
     stated = float(message.split("lies (")[1].split(",")[0])
@@ -80,7 +80,7 @@ def test_a_star_elsewhere_is_said(offset):
     assert said(observation, moves=True) == []
 
 
-def test_what_was_refined_is_not_said():
+def test_refined_position_gives_no_warning():
     observation = observe(moffat(WIDTH), star=(STAR[0] + 0.6, STAR[1]))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -119,7 +119,7 @@ def test_of_several_images_the_worst_is_named():
 
 
 @pytest.mark.parametrize("given", [{}, {"epochs": ["a"]}, {"epochs": ["a", "b"]}])
-def test_what_a_warning_advises_is_taken_for_these_images(given):
+def test_advised_position_refinement_corrects_the_position(given):
     n = len(given.get("epochs", "a"))
     image = observe(moffat(WIDTH), seed=3).images[0]
     observation = lnocl.Observation(np.array([image] * n), moffat(WIDTH), background=LEVEL, **given)

@@ -157,7 +157,7 @@ def test_the_psf_on_the_sky_is_turned_back_as_the_common_one_is(turn):
         assert found[1:] == expected[1:]
 
 
-def test_the_largest_window_holds_what_the_star_and_the_sky_share():
+def test_largest_window_covers_the_adjoint_of_the_star_cutouts():
     scene = Scene(observe(star_psfs=np.full((101, 121), 1e-5)), [STAR], pad=100)
     model = Model(scene)
     shared = model.adjoint_of_cutouts([scene.star_cutout(j, 0) for j in range(2)])
@@ -193,7 +193,7 @@ def test_a_psf_of_its_own_like_the_common_one_gives_the_flux_over_its_share():
         assert found.core.n_pixels == expected.core.n_pixels
 
 
-def test_the_sky_takes_no_more_than_what_images_showed_of_the_star():
+def test_sky_gains_only_the_share_of_lost_star_flux_that_images_show():
     """The estimate has a hole under a star that is too bright by less than the hole."""
     y, x = np.indices((N, N)) - np.array(STAR[::-1])[:, None, None]
     under = 40 * np.exp(-(x**2 + y**2) / 128)
@@ -308,7 +308,7 @@ def test_a_planet_in_the_halo_of_the_star_and_the_star_have_fluxes_within_errors
         ),
     ],
 )
-def test_what_is_no_psf_of_a_star_is_refused(changes, message):
+def test_invalid_psfs_and_places_of_stars_are_refused(changes, message):
     with pytest.raises(lnocl.InputError) as refused:
         observe(**changes)
     assert message in refused.value.message

@@ -112,7 +112,7 @@ def test_a_hidden_radius_ends_at_the_nearest_pixel_that_an_image_has_observed():
     assert hidden(np.array([disc, larger]), star) == pytest.approx(found)
 
 
-def test_what_is_hidden_is_core():
+def test_hidden_core_is_expected_to_match_its_surroundings():
     """Light in it is expected to be that round it, however much the estimate has there."""
     sky = np.where(np.hypot(X - 16, Y - 16) < 6, 50.0, 2.0) + 0.1 * X
     stars, radii = np.array([(16.0, 16.0)]), np.array([7.0])

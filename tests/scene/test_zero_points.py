@@ -43,7 +43,7 @@ KINDS = {
 
 
 @pytest.mark.parametrize("name", KINDS)
-def test_a_zero_point_is_told_in_images_of_every_kind(name):
+def test_zero_points_are_measured_in_images_of_every_kind(name):
     observation = observe(**KINDS[name])
     found = zero_points(Scene(observation, STARS))
     assert found.n_stars == 2
@@ -64,7 +64,7 @@ RIGHT = {
 
 @pytest.mark.parametrize("name", RIGHT)
 @pytest.mark.parametrize("seed", range(3))
-def test_there_is_none_where_the_images_do_not_tell_it(name, seed):
+def test_zero_points_are_absent_where_images_do_not_determine_them(name, seed):
     observation = observe(**{"factors": np.ones(3), **RIGHT[name]}, seed=seed)
     assert zero_points(Scene(observation, STARS)) is None
 
@@ -97,7 +97,7 @@ def test_images_of_several_epochs_need_three_stars():
 
 
 @pytest.mark.parametrize("seed", range(10))
-def test_three_stars_that_vary_and_agree_by_chance_tell_none(seed):
+def test_chance_agreement_of_three_variable_stars_gives_no_zero_points(seed):
     """By a tenth in each of twelve nights; most such scenes had one, and 100 nights two."""
     rng, x = np.random.default_rng(seed), np.indices((80, 80))[1]
     stars = np.array([(22.2, 24.0), (57.0, 26.4), (40.7, 56.1)])

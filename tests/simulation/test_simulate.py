@@ -74,7 +74,7 @@ def test_strehl_ratio(strehl):
     assert ratio == pytest.approx(strehl, abs=0.002)
 
 
-def test_faint_core_reaches_what_the_halo_allows():
+def test_low_strehl_ratio_gives_a_faint_core():
     assert psf_of(256, strehl=1e-4).max() / psf_of(256).max() < 0.01
 
 

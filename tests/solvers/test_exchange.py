@@ -76,7 +76,7 @@ def dense(near):
     )
 
 
-def test_the_light_is_what_the_dense_matrix_has_more_with_the_source_unknown(monkeypatch):
+def test_exchanged_light_matches_the_dense_matrix(monkeypatch):
     monkeypatch.setattr(exchange, "FINISHED", 1e-6)
     monkeypatch.setattr("lnocl.core.solvers.near_star.WINDOW", 4.0)
     estimate = an_estimate(SKIES["lopsided host"][0], depths=(1.0, 0.6))
@@ -94,10 +94,10 @@ def test_hosts_and_nothing_else_exchange_much(name):
     assert share > 0.1 if is_host else share < 0.02
 
 
-def test_nothing_is_said_where_psfs_are_exact():
+def test_exchanged_light_is_zero_for_exact_psfs():
     assert exchanged(an_estimate(SKIES["host"][0], error=0.0), 0.0) == 0
 
 
-def test_what_cannot_be_as_much_as_the_least_is_not_computed(monkeypatch):
+def test_exchanged_light_below_the_minimum_is_not_computed(monkeypatch):
     monkeypatch.setattr(exchange, "NearStar", None)
     assert exchanged(an_estimate(SKIES["alone"][0]), 0.1) == 0

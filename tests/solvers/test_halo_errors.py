@@ -147,7 +147,7 @@ def test_amounts_take_the_step_of_the_dense_matrix(monkeypatch):
     )
 
 
-def test_what_lies_beyond_a_window_is_the_information_of_each_image():
+def test_information_beyond_a_window_matches_an_explicit_sum():
     scene, sky, fluxes, mean = an_estimate()
     raised = np.array([4.0, 1.5])
     around = near_star.Surroundings(Estimate(scene, sky, fluxes), False, raised)
@@ -173,7 +173,7 @@ def test_a_halo_that_is_known_leaves_a_star_the_error_of_counts():
 
 
 @pytest.mark.parametrize("moves", [False, True])
-def test_a_window_and_what_lies_beyond_it_are_the_grid(monkeypatch, moves):
+def test_errors_from_a_window_match_those_of_the_whole_grid(monkeypatch, moves):
     """Broad halos are told from beyond the window, compact ones in it."""
     monkeypatch.setattr(near_star, "WINDOW", 4.0)
     scene, sky, fluxes, _ = an_estimate(sky=0.05 * SKY)

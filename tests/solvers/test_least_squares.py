@@ -102,7 +102,7 @@ def dense_covariance(images, field, k):
     return np.linalg.inv(information)[:k, :k]
 
 
-def test_variances_are_those_of_the_inverse_and_lack_no_more_than_is_said():
+def test_variances_match_the_dense_inverse_within_the_stated_tolerance():
     images, field, k = nights(6)
     whole = dense_covariance(images, field, k)
     expected, fit = np.diag(whole), LeastSquares(images, [field], np.zeros(k), 2000, 1e-12)

@@ -117,7 +117,7 @@ def test_errors_are_the_scatter_of_sums(known):
     assert abs(np.mean(fluxes) - (SHARES * SKY).sum()) < 0.03 * SKY.sum()
 
 
-def test_errors_of_stars_are_those_of_what_is_round_them():
+def test_light_error_includes_errors_of_stars_inside_the_region_only():
     scene, sky = a_scene({}, pad=0)
     light, none = Light(Estimate(scene, sky, FLUXES)), np.zeros(2)
     alone = light.flux(SHARES, none)[1]

@@ -105,7 +105,7 @@ def test_shapes_of_psfs_that_may_be_wrong_are_held(monkeypatch):
     np.testing.assert_allclose(found, FLUXES, rtol=0.01)
 
 
-def test_no_flux_is_negative_and_none_comes_back():
+def test_fluxes_are_not_negative_and_absent_stars_stay_at_zero():
     """Where the images show nothing of a star that the estimate has, or has no more."""
     scene = a_scene(fluxes=np.array([0.0, 3e4]))
     for held in (10.0, 0.0):
@@ -135,7 +135,7 @@ class TestByDefault:
         near = np.hypot(X, Y) < 5
         assert all(abs(r.extended[near].sum() / HOST[near].sum() - 1) < 0.1 for r in results)
 
-    def test_a_smoothing_that_is_given_leaves_what_the_iteration_has(self):
+    def test_given_smoothing_disables_marginal_fluxes(self):
         result = self.run(0, smoothing=0.0, stop=None, n_iter=20)
         before = result._outcome
         assert not before.is_marginal

@@ -253,7 +253,7 @@ def fitted(observation, given, level, flux):
 
 
 @pytest.mark.exhaustive
-def test_scatter_is_what_the_errors_say():
+def test_scatter_of_fits_matches_their_errors():
     """Of 100 realisations; the sum of squares over the errors' has a chi-square distribution."""
     truth, level, n = np.array([2000.0, 15.3, 16.4]), 5.0, 100
     pulls = []

@@ -175,7 +175,7 @@ def test_slopes_of_images_are_those_of_stars_through_changed_psfs(kind):
             np.testing.assert_allclose(slopes[k], expected, rtol=0, atol=0.02 * abs(expected).max())
 
 
-def test_zero_points_are_of_images_of_one_epoch_and_are_none_together():
+def test_zero_points_are_unknowns_within_an_epoch_without_a_common_part():
     estimate = scene_of(lopsided(), psf_error=0.03, epochs=[0, 1, 1])
     views = [View(estimate.scene, j) for j in range(3)]
     errors = PsfErrors(estimate, views)

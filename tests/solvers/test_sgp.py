@@ -373,7 +373,7 @@ def engine_of(name, precision, takes_steps):
 
 
 @pytest.mark.parametrize("name", [ON_DEVICE, pytest.param("bare", marks=pytest.mark.exhaustive)])
-def test_memory_estimate_is_what_the_buffers_hold(name):
+def test_memory_estimate_equals_the_size_of_the_buffers(name):
     engine = engine_of(name, "single", takes_steps=True)
     engine.extended()  # waits for the device
     launcher = engine._launcher

@@ -231,7 +231,7 @@ def test_fluxes_scatter_as_their_errors_say():
 
 @pytest.mark.parametrize("known", KNOWN.values(), ids=KNOWN)
 @pytest.mark.filterwarnings("ignore:the images are shifted")
-def test_windows_hold_what_the_grid_does(known):
+def test_window_values_match_the_grid(known):
     """Beyond padded images too, and where the window wraps round."""
     counts = RNG.poisson(20.0, (2, N, N))
     scene = Scene(lnocl.Observation(counts, PSFS, background=3.0, **known), STARS, pad=4)

@@ -153,7 +153,7 @@ class TestAdvice:
             f"deviation {best['deviation']:.1e}"
         )
 
-    def test_where_there_is_none_it_says_so(self, table):
+    def test_unreachable_accuracy_gives_no_advice(self, table):
         assert bench.advice(table[:3], 1e-9) == (
             "for an accuracy of 1e-09: no setting is so close to the reference"
         )
@@ -188,7 +188,7 @@ class TestCommand:
         assert rows[3][-1] == f"{expected:.2%}"
         assert {row[1] for row in rows} == {"0", "32"}
 
-    def test_what_is_interrupted_has_shown_its_complete_runs(self, capsys, monkeypatch):
+    def test_interrupted_bench_prints_its_complete_runs(self, capsys, monkeypatch):
         calls, deconvolve = [], bench.deconvolve
 
         def stop(*arguments, **keywords):

@@ -93,7 +93,7 @@ class TestDemo:
         )
 
     @pytest.mark.exhaustive
-    def test_without_matplotlib_it_says_what_to_install(self, capsys, monkeypatch):
+    def test_missing_matplotlib_is_reported_once_and_results_are_written(self, capsys, monkeypatch):
         monkeypatch.setitem(sys.modules, "matplotlib", None)
         monkeypatch.setattr(demo, "N_ITER", 20)
         assert cli.main(["demo", *SMALL]) == 0

@@ -149,7 +149,7 @@ def test_the_scenes_have_every_option_of_the_kernels(monkeypatch):
 
 
 @pytest.mark.parametrize("k", range(3))
-def test_a_reconstruction_strays_by_the_worst_of_what_it_returns(monkeypatch, k):
+def test_deviation_of_a_reconstruction_is_the_largest_of_its_arrays(monkeypatch, k):
     def reconstruct(case, solver, n_iter, precision, engine, device):
         found = [np.full(3, 2.0) for _ in range(3)]
         found[k][1] += 2e-3 * (engine == "opencl")
@@ -163,7 +163,7 @@ def test_a_reconstruction_strays_by_the_worst_of_what_it_returns(monkeypatch, k)
 @pytest.mark.parametrize(
     "name", ["correlate_columns", pytest.param("convolve_columns", marks=pytest.mark.exhaustive)]
 )
-def test_what_a_wrong_kernel_spoils_is_named(capsys, plant, name):
+def test_cases_with_a_wrong_kernel_are_named(capsys, plant, name):
     plant(name)
     status, out, err = outcome(capsys)
     assert status == 1
@@ -231,7 +231,7 @@ def test_the_verdict_names_each_that_is_wrong():
     assert str(raised.value) == f"WRONG on {NAME}: {wrong}: {ADVICE}"
 
 
-def test_what_is_not_there_is_no_small_deviation():
+def test_relative_deviation_from_zero_is_infinite_and_from_nan_is_nan():
     assert selftest.relative([], []) == 0.0
     assert selftest.relative([0.0], [0.0]) == 0.0
     assert selftest.relative([1e-9], [0.0]) == math.inf

@@ -105,7 +105,7 @@ def test_each_button_shows_its_picture_and_the_first_shows_all(page):
     wait_for(page, lambda: page.execute_script(row) == LAYERS)
 
 
-def test_what_errors_of_the_psf_may_fake_is_outlined_in_red(page):
+def test_doubtful_pixels_are_outlined_in_red(page):
     page.find_elements("css selector", "#layers button")[4].click()
     wait_for(page, lambda: layer(page) == "extended source")
     red, green, blue = colour(page, 30 - 0.45, 35)
@@ -197,7 +197,7 @@ def test_regions_and_images_are_chosen(page):
     wait_for(page, lambda: picture(page, row=1) != before)
 
 
-def test_the_value_under_the_pointer_is_said(page):
+def test_value_under_the_pointer_is_displayed(page):
     from selenium.webdriver import ActionChains
 
     page.find_element("id", "marks").click()

@@ -42,7 +42,7 @@ print("peak", next(int(s.split()[1]) for s in open("/proc/self/status") if "VmHW
 
 
 @pytest.mark.parametrize(("n", "p", "error"), [(0, 1, 0.03), (1500, 1, 0.0), (150, 4, 0.03)])
-def test_what_stars_take_is_announced(n, p, error):
+def test_memory_estimate_is_within_a_third_of_the_measured_peak(n, p, error):
     """Before, 1000 and 3000 stars were said to take as much as none, a third of their memory."""
     command = [sys.executable, "-c", RUN, str(n), str(p), str(error)]
     # The first may compile kernels, which takes 100 MiB more.

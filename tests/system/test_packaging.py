@@ -208,7 +208,7 @@ def test_addresses_are_of_one_repository(built):
     assert all(address.startswith(f"{url}/") for address in urls.values())
 
 
-def test_the_recipe_of_conda_forge_requires_what_the_wheel_does(built):
+def test_conda_forge_recipe_has_the_requirements_of_the_wheel(built):
     recipe = (ROOT / "docs/developing/recipe.yaml").read_text()
     block = re.search(r"^  run:\n((?:    .*\n)+)", recipe, re.M)[1]
     required = {str(one) for one in metadata(built).requires_dist if one.marker is None}

@@ -101,7 +101,9 @@ class TestLensedQuasar:
                 "--psf-error", "0", "--n-iter", "60", "--mu", "1e-7", "--pad", "4"]  # fmt: skip
 
     @engines
-    def test_what_comes_out(self, arguments, engine, capsys):
+    def test_lensed_quasar_has_the_measured_fluxes_and_the_wcs_of_the_image(
+        self, arguments, engine, capsys
+    ):
         assert main([*arguments, "--engine", engine, "-o", "out.fits"]) == 0
         # None of the noise, though it was drizzled. The PSF is twice as wide as the stars.
         told = [line for line in capsys.readouterr().err.splitlines() if "warning" in line]
