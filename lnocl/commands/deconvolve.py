@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 from lnocl.commands import checkpoints, messages, options, pictures, record
 from lnocl.commands.deconvolve_options import ALL_OPTIONS, OPTIONS, PARAMETERS
 from lnocl.commands.parser import Command
+from lnocl.core.scene.counts import means
 from lnocl.deconvolution import deconvolve
 from lnocl.errors import InputError, MisfitWarning, detail, warn
 from lnocl.progress import Progress
@@ -213,10 +214,10 @@ def _used(repeated: Mapping[str, Any], frames: Frames, result: Result) -> dict[s
 
 def _levels(frames: Frames, result: Result) -> list[Any]:
     """Return the background as given, with the levels that were fitted."""
-    before, after = frames.observation.background, result._observation.background
-    errors = frames.observation.background_error
+    before, after = frames.observation, result._observation
+    changed = means(after.background, after.mask) - means(before.background, before.mask)
     return [
-        float(word + after[j].mean() - before[j].mean()) if errors[j] > 0 else word
+        float(word + changed[j]) if before.background_error[j] > 0 else word
         for j, word in enumerate(frames.background)
     ]
 

@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
-from lnocl.errors import InputError
+from lnocl.errors import InputError, note
 from lnocl.io.names import ERR, parse_kind
 from lnocl.parallel import CURRENT
 
@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 SWITCHES = {"store_true": True, "store_false": False}
 # The action of a switch that is turned on by its flag, and off by the same with no- before it.
 EITHER = argparse.BooleanOptionalAction
+# A star of a table that is so near to one given by its place is that, pixels.
+SAME_STAR = 1.5
 # The keywords of an option that takes several values and may be repeated.
 SEVERAL: dict[str, Any] = {"nargs": "+", "action": "extend"}
 
@@ -297,7 +299,13 @@ def star_places(
     if table:
         from lnocl.io.star_files import read_stars
 
-        places += read_stars(table, header, image).tolist()
+        given = places.copy()
+        for x, y in read_stars(table, header, image).tolist():
+            again = any(math.dist((x, y), place) < SAME_STAR for place in given)
+            if again:
+                note("%s: its star at (%.7g, %.7g) is one of `stars`, and taken once", table, x, y)
+            else:
+                places.append((x, y))
     return [(x, y) for x, y in places]
 
 

@@ -76,7 +76,7 @@ def draw(axis: Axes, curves: LightCurves) -> None:
 
 
 def _mark(axis: Axes, epochs: NDArray[Any], labels: Sequence[str]) -> None:
-    """Mark an axis with dates, numbers, or labels where they are few."""
+    """Mark an axis with dates, numbers, or labels, not all where they are many."""
     from matplotlib.dates import AutoDateLocator, ConciseDateFormatter
     from matplotlib.ticker import MaxNLocator
 
@@ -85,7 +85,8 @@ def _mark(axis: Axes, epochs: NDArray[Any], labels: Sequence[str]) -> None:
         locator = AutoDateLocator(maxticks=8)
         axis.xaxis.set_major_locator(locator)
         axis.xaxis.set_major_formatter(ConciseDateFormatter(locator))
-    elif epochs.tolist() == [*range(len(labels))] and len(labels) <= MOST_LABELS:
-        axis.set_xticks(epochs, [as_text(label) for label in labels])
+    elif epochs.tolist() == [*range(len(labels))]:
+        step = -(-len(labels) // MOST_LABELS)
+        axis.set_xticks(epochs[::step], [as_text(label) for label in labels[::step]])
     else:
         axis.xaxis.set_major_locator(MaxNLocator(8))

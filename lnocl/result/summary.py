@@ -181,11 +181,11 @@ def _light_curves(result: Result, unit: Unit) -> list[str]:
 
 def _trust(result: Result, unit: Unit, is_warned: bool) -> Iterator[str]:
     """Yield whether to trust a result and why not; then what its extended source may hold."""
-    from lnocl.result.verdict import faults
+    from lnocl.result.verdict import faults, is_doubt
 
-    first, *others = faults(result) or [""]
+    first, *others = found = faults(result) or [""]
     if first:
-        yield f"no: {first}"
+        yield f"{'perhaps' if all(map(is_doubt, found)) else 'no'}: {first}"
         yield from others
     elif is_warned:
         yield f"yes, but see the warnings: {_residuals(result.fit())}"
@@ -237,7 +237,7 @@ def _unnamed(result: Result, unit: Unit) -> Iterator[str]:
         yield (
             f"{counted(n, 'source')} in the extended source {'is' if n == 1 else 'are'} as sharp "
             f"as stars, the brightest at ({x:.7g}, {y:.7g}) with {light / unit.electrons:.3g} "
-            f"{unit.name}: give them as `stars` too; lnocl stars lists them"
+            f"{unit.name}: give what is a star as `stars` too, and mask what is a cosmic ray"
         )
 
 

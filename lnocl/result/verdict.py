@@ -120,6 +120,11 @@ def faults(result: Result) -> list[str]:
     return lines
 
 
+def is_doubt(fault: str) -> bool:
+    """Return whether a fault may be none: light that a host has, or may exchange with its star."""
+    return fault.startswith("light lies all round") or " may exchange light with " in fault
+
+
 class _Told:
     """What is told of stars, once of each, whatever epochs it is of."""
 

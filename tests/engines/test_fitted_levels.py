@@ -68,8 +68,11 @@ def test_fitted_level_is_reported_with_its_error(log):
     assert line.startswith("image 0: background 8")
 
 
-def test_reported_levels_exclude_the_read_noise_term():
-    observed = {"background": np.full((1, 1, 1), 29.0), "read_noise": np.full((1, 1, 1), 3.0)}
+def test_reported_levels_exclude_the_read_noise_term_and_bad_pixels():
+    """Which maps are 0 in."""
+    mask = np.array([[[False, True]]])
+    maps = np.where(mask, 0.0, 29.0), np.where(mask, 0.0, 3.0)
+    observed = {"background": maps[0], "read_noise": maps[1], "mask": mask}
     scene = SimpleNamespace(observation=SimpleNamespace(**observed))
     levels = SimpleNamespace(errors=np.array([[0.25]]))
     outcome = SimpleNamespace(levels=levels, has_levels=True, scene=scene)

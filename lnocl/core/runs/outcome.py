@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from lnocl.core.runs.start import Setup
 from lnocl.core.scene.arrays import Array
+from lnocl.core.scene.counts import means
 from lnocl.core.scene.estimate import Estimate
 from lnocl.core.scene.observation import Observation
 from lnocl.core.scene.scene import Scene
@@ -282,8 +283,11 @@ class Outcome:
         if self.levels is None or not self.has_levels:
             return []
         observation = self.scene.observation
-        pairs = zip(observation.background, observation.read_noise, strict=True)
-        levels = [float(np.mean(level) - np.mean(noise**2)) for level, noise in pairs]
+        levels, noise = (
+            means(each, observation.mask)
+            for each in (observation.background, observation.read_noise**2)
+        )
+        levels = levels - noise
         return [
             f"`images[{j}]`: background {levels[j]:.6g} +- {error:.2g} electrons per pixel, fitted "
             "with the rest"

@@ -231,7 +231,8 @@ def _epochs(_: Field, epochs: Any, held: Observation) -> NDArray[np.intp]:
             f"`epochs` holds labels without an order, of {' and '.join(kinds)}; give numbers "
             "alone, or text alone"
         ) from None
-    held.epoch_labels = tuple(map(str, distinct.tolist()))
+    texts = (f"{each:.15g}" if isinstance(each, float) else str(each) for each in distinct.tolist())
+    held.epoch_labels = tuple(texts)
     return numbered.astype(np.intp)
 
 
