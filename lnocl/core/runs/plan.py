@@ -81,7 +81,7 @@ WHOLE = Condition(lambda plan: not plan.in_tiles, "the images are divided into t
 
 # What each step needs, in the order in which reasons are given.
 NEEDS: dict[str, tuple[Condition, ...]] = {
-    PLACES: (AUTO, MENDS, HAS_STARS, SEVERAL, SHOWS_PSFS),
+    PLACES: (AUTO, MENDS, HAS_STARS, SEVERAL, SHOWS_PSFS, NO_HALOS),
     CORES: (AUTO, MENDS, HAS_STARS),
     RAYS: (AUTO, MENDS),
     EXPOSURES: (AUTO, MENDS, HAS_STARS, SEVERAL, STEADY_STARS, NO_HALOS),
