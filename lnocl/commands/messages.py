@@ -66,15 +66,7 @@ def in_shell(message: str, flags: Mapping[str, str]) -> str:
     return re.sub(r"(--[\w-]+)=", r"\1 ", typed)
 
 
-def show_warning(
-    flags: Mapping[str, str],
-    message: Warning | str,
-    category: type[Warning],
-    filename: str,
-    lineno: int,
-    file: TextIO | None = None,
-    line: str | None = None,
-) -> None:
+def show_warning(flags: Mapping[str, str], message: Warning | str, *_: object) -> None:
     """Write a warning to stderr, with `in_shell`, in place of `warnings.showwarning`."""
     _note(f"warning: {in_shell(_message_of(message), flags)}")
 

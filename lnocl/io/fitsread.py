@@ -15,10 +15,10 @@ from lnocl.core.scene.transforms import enlarged
 from lnocl.errors import FileError, InputError, counted, detail, note, warn
 from lnocl.io.encoded import linear
 from lnocl.io.fitsfile import open_fits
-from lnocl.io.headers import finer_cards, make_wcs, quiet_log, readable
+from lnocl.io.headers import finer_cards, make_wcs, readable
 from lnocl.io.names import parse_name
 from lnocl.io.selection import choose, describe, find, has_pixels, name_of, only
-from lnocl.process import ignored_warnings
+from lnocl.process import ignored_notes, ignored_warnings
 
 # Beginnings of CTYPE3 of cubes whose planes are not of one sky: colours, energies, velocities,
 # polarisations.
@@ -246,7 +246,7 @@ def wcs_cards(header: fits.Header) -> fits.Header:
         try:
             # Cards that astropy mends on reading are written mended.
             wcs = make_wcs(header, key or " ")
-            with ignored_warnings(), quiet_log():
+            with ignored_warnings(), ignored_notes("astropy"):
                 if key and not wcs.wcs.ctype[0].endswith("-SIP"):
                     wcs.sip = None  # that of the primary system, which astropy gives to all
                 cards.update(wcs.to_header(relax=True))

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from lnocl.core.scene.apertures import Aperture, Profile
-from lnocl.errors import FileError, InputError, LnoclError, note
+from lnocl.errors import FileError, InputError, installed, note
 from lnocl.io.fitsread import sky_header
 from lnocl.io.sky import celestial_wcs
 
@@ -136,13 +136,7 @@ def _in_pixels(given: Given, header: fits.Header | None) -> list[_Found]:
 
 
 def _regions() -> Any:
-    try:
-        import regions
-    except ImportError as error:
-        raise LnoclError(
-            "`regions` are read by the package regions: pip install regions"
-        ) from error
-    return regions
+    return installed("regions", "`regions` are read by the package regions")
 
 
 def _read(path: str) -> list[Any]:

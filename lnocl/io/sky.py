@@ -15,8 +15,8 @@ from astropy.wcs.utils import pixel_to_pixel
 
 from lnocl.core.scene.arrays import Array
 from lnocl.errors import InputError
-from lnocl.io.headers import make_wcs, quiet_log
-from lnocl.process import ignored_warnings
+from lnocl.io.headers import make_wcs
+from lnocl.process import ignored_notes, ignored_warnings
 
 # Largest variation of the offset between two images over them, in pixels, from rotation, scale and
 # distortion.
@@ -45,7 +45,7 @@ def has_celestial(header: fits.Header) -> bool:
 
 
 def _find_wcs(header: fits.Header) -> WCS | None:
-    with ignored_warnings(), quiet_log():  # of faults that astropy mends
+    with ignored_warnings(), ignored_notes("astropy"):  # of faults that astropy mends
         try:
             wcs = make_wcs(header)
             _ = wcs.pixel_to_world(0, 0).icrs  # those of the Sun are not on the sky
