@@ -56,7 +56,7 @@ OPTIONS = [
     ),
     options.STAR_TABLE,
     options.STARS.but(
-        ("--without",),
+        "--without",
         needs=("star_table",),
         dest="without",
         help="position of a star of --stars that is not taken, such as your target with what "
