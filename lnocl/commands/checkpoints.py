@@ -6,14 +6,11 @@ import argparse
 import contextlib
 import os
 import signal
-from typing import TYPE_CHECKING
 
 from lnocl.commands.signals import ENDING, first_handled
 from lnocl.errors import InputError, LnoclError, counted
 from lnocl.io import atomic
-
-if TYPE_CHECKING:
-    from lnocl.result import Result
+from lnocl.result import Result
 
 SIGNALS = (signal.SIGINT, *ENDING)
 

@@ -87,21 +87,17 @@ def recorded(flags: Mapping[str, str], shows: Callable[[Warning], bool]) -> Iter
         Given a warning, returns whether it is shown too.
     """
     lines: list[str] = []
-    show = warnings.showwarning
 
     def record(message: Warning | str, *where: Any, **more: Any) -> None:
         lines.append(f"warning: {in_shell(_message_of(message), flags)}")
         if isinstance(message, str) or shows(message):
             show(message, *where, **more)
 
-    warnings.showwarning = record
     notes = _Notes(flags, lines.append, logging.DEBUG)
     notes.addFilter(lambda record: not getattr(record, "is_passing", False))
-    try:
-        with _handled(LOG, notes):
-            yield lines
-    finally:
-        warnings.showwarning = show
+    with warnings.catch_warnings(), _handled(LOG, notes):
+        show, warnings.showwarning = warnings.showwarning, record
+        yield lines
 
 
 @contextlib.contextmanager

@@ -360,14 +360,9 @@ def _result_cards(stars: Sequence[StarPsf]) -> list[Card]:
 def _figure(arguments: argparse.Namespace, stars: Sequence[StarPsf]) -> Figure:
     from lnocl.plotting.psf import draw_star_psf
 
-    first = stars[0]
-    return draw_star_psf(
-        first.frame - first.background,
-        first.bad,
-        first.centres,
-        [star.psf for star in stars],
-        arguments.rotate,
-    )
+    first, psfs = stars[0], [star.psf for star in stars]
+    light = first.frame - first.background
+    return draw_star_psf(light, first.bad, first.centres, psfs, arguments.rotate)
 
 
 COMMAND = Command(

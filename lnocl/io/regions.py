@@ -6,19 +6,16 @@ import os
 import re
 import warnings
 from collections.abc import Iterable
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+from astropy.io import fits
 
 from lnocl.core.scene.apertures import Aperture, Profile
+from lnocl.core.scene.observation import Observation
 from lnocl.errors import FileError, InputError, installed, note
 from lnocl.io.fitsread import sky_header
 from lnocl.io.sky import celestial_wcs
-
-if TYPE_CHECKING:
-    from astropy.io import fits
-
-    from lnocl.core.scene.observation import Observation
 
 # The share of a region that rounding may leave outside an image.
 ROUNDING = 1e-9
@@ -224,7 +221,12 @@ def _refuse_outside(described: str, region: Any, shape: tuple[int, int]) -> None
     if box is None or not (
         -2 <= box.ixmin <= box.ixmax <= nx + 2 and -2 <= box.iymin <= box.iymax <= ny + 2
     ):
-        raise InputError(f"{described} lies outside the image of {nx} x {ny} pixels, or partly")
+        raise _outside(described, shape)
+
+
+def _outside(described: str, shape: tuple[int, int]) -> InputError:
+    ny, nx = shape
+    return InputError(f"{described} lies outside the image of {nx} x {ny} pixels, or partly")
 
 
 def _filled(region: Any, which: str) -> Any:
@@ -256,9 +258,7 @@ def _aperture(name: str, described: str, region: Any, shape: tuple[int, int]) ->
     inside = mask.cutout(np.ones(shape), fill_value=0.0)
     total = weights.sum()
     if inside is None or (weights * (inside == 0)).sum() > ROUNDING * total:
-        raise InputError(
-            f"{described} lies outside the image of {shape[1]} x {shape[0]} pixels, or partly"
-        )
+        raise _outside(described, shape)
     if total == 0:
         raise InputError(f"{described} encloses no part of a pixel")
     rows, columns = np.flatnonzero(weights.any(axis=1)), np.flatnonzero(weights.any(axis=0))

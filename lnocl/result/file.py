@@ -5,25 +5,21 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 from importlib.metadata import version
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from astropy.io import fits
 
 from lnocl.core.runs.outcome import Outcome, PsfRefinement
+from lnocl.core.scene.observation import Observation
 from lnocl.errors import note
 from lnocl.io import sky
 from lnocl.io.fitsread import wcs_cards
 from lnocl.io.fitswrite import Card, column_unit, write_result
 from lnocl.io.parts import PARTS, Column
+from lnocl.result import Result
 from lnocl.result.kept import to_parts
 from lnocl.result.views import electrons_in
-
-if TYPE_CHECKING:
-    from astropy.io import fits
-
-    from lnocl.core.scene.observation import Observation
-    from lnocl.result import Result
-
 
 # The table ESTIMATE has this many bytes at most.
 MOST_BYTES = 2**26
