@@ -16,6 +16,7 @@ from lnocl.core.scene.observation import Observation
 from lnocl.errors import FileError, InputError, installed, note
 from lnocl.io.fitsread import sky_header
 from lnocl.io.sky import celestial_wcs
+from lnocl.process import recorded_warnings
 
 # The share of a region that rounding may leave outside an image.
 ROUNDING = 1e-9
@@ -74,10 +75,7 @@ def read_apertures(
     InputError
         A region that encloses nothing, lies outside the image, or on the sky without coordinates.
     """
-    return [
-        _aperture(each.name, each.described, each.region, shape)
-        for each in _in_pixels(given, header)
-    ]
+    return [_aperture(each, shape) for each in _in_pixels(given, header)]
 
 
 def read_profiles(
@@ -141,8 +139,7 @@ def _read(path: str) -> list[Any]:
     if not os.path.isfile(path):
         raise FileError(f"{path} is not there: give a file of regions, such as DS9 writes")
     try:
-        with warnings.catch_warnings(record=True) as skipped:
-            warnings.simplefilter("always")
+        with recorded_warnings() as skipped:
             found = list(regions.Regions.read(path))
         if not found:
             return _read_without_frame(path)
@@ -196,15 +193,13 @@ def _profile(found: _Found, shape: tuple[int, int]) -> Profile:
     along, across = ((cos, sin), (-sin, cos)) if is_wide else ((-sin, cos), (cos, sin))
     n = max(round(length), 1)
     at = (np.arange(n) + 0.5) * length / n - length / 2.0
-    slices = []
+    slices, distances = [], []
     for distance in at:
         x, y = box.center.x + distance * along[0], box.center.y + distance * along[1]
         sides = (length / n, breadth) if is_wide else (breadth, length / n)
         part = regions.RectanglePixelRegion(regions.PixCoord(x, y), *sides, angle=box.angle)
-        slices.append(_aperture(found.name, found.described, part, shape))
-    distances = []
-    for each in slices:
-        y, x = each.places
+        slices.append(_aperture(found._replace(region=part), shape))
+        y, x = slices[-1].places
         distances.append((x - box.center.x) * across[0] + (y - box.center.y) * across[1])
     return Profile(found.name, at.tolist(), slices, distances)
 
@@ -240,7 +235,8 @@ def _filled(region: Any, which: str) -> Any:
     return getattr(_regions(), kind + end)(region.center, *sides, **turned)
 
 
-def _aperture(name: str, described: str, region: Any, shape: tuple[int, int]) -> Aperture:
+def _aperture(found: _Found, shape: tuple[int, int]) -> Aperture:
+    region, name, described = found
     _refuse_outside(described, region, shape)
     outer, inner = _filled(region, "outer"), _filled(region, "inner")
     try:
