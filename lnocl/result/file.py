@@ -168,11 +168,8 @@ def _star_columns(
     """Return the columns of the table of stars after positions and fluxes."""
     columns, positions = [], result.star_positions
     if np.isfinite(result.star_position_errors).any():
-        x_error, y_error = result.star_position_errors.T
-        columns += [
-            Column("x_error", x_error, "pix", "standard error"),
-            Column("y_error", y_error, "pix", "standard error"),
-        ]
+        for axis, each in zip("xy", result.star_position_errors.T, strict=True):
+            columns.append(Column(f"{axis}_error", each, "pix", "standard error"))
     flux_errors = result.star_flux_errors / electrons
     columns.append(Column("flux_error", flux_errors, column_unit(unit), "standard error"))
     if (n_epochs := result._observation.n_epochs) > 1:
