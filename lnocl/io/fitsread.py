@@ -297,15 +297,11 @@ def _read_file(
 
 
 def _check_shape(
-    path: str,
-    shape: tuple[int, ...],
-    first_path: str,
-    first_shape: tuple[int, ...],
-    alone: bool,
+    path: str, shape: tuple[int, ...], first_path: str, first_shape: tuple[int, ...], alone: bool
 ) -> None:
-    found = f"{path} has an image of {counted(len(shape), 'dimension')}"
-    if alone and len(shape) not in (2, 3):
-        raise InputError(f"{found}; two are needed, or three for a cube of images: cut the others")
+    if len(shape) not in (2, 3):
+        needed = "two are needed" + ", or three for a cube of images: cut the others" * alone
+        raise InputError(f"{path} has an image of {counted(len(shape), 'dimension')}; {needed}")
     if are_colours(shape):
         raise InputError(
             f"{path} has the shape {shape}: its last axis is of colours or channels; give one of "
@@ -316,8 +312,6 @@ def _check_shape(
             f"{path} holds {shape[0]} images, such as integrations; each of several files needs "
             "one: give their mean, or one of them"
         )
-    if not alone and len(shape) != 2:
-        raise InputError(f"{found}; two are needed")
     if shape != first_shape:
         raise InputError(
             f"{path} has the shape {shape} and {first_path} {first_shape}; they must be the same"
