@@ -189,10 +189,6 @@ def _one_line(text: str, stream: TextIO) -> str:
     """Return text in one line, with escapes for characters that a terminal cannot show."""
     joined = " ".join(part.strip() for part in text.splitlines())
     joined = " " * (len(text) - len(text.lstrip(" "))) + joined
-    shown = "".join(c if c.isprintable() else _escape(c) for c in joined)
+    shown = "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in joined)
     encoding = stream.encoding or "ascii"
     return shown.encode(encoding, "backslashreplace").decode(encoding)
-
-
-def _escape(character: str) -> str:
-    return character.encode("unicode_escape").decode("ascii")
