@@ -180,18 +180,10 @@ def _word(value: Any) -> str:
     return ",".join(map(repr, value if isinstance(value, tuple) else (value,)))
 
 
-def number_or_word(text: str) -> float | str:
-    """Return a number where a text is one, else the text."""
+def or_word(kind: type[float] | type[int], text: str) -> float | str:
+    """Return a number, or a whole one, where a text is one, else the text."""
     try:
-        return float(text)
-    except ValueError:
-        return text
-
-
-def whole_or_word(text: str) -> int | str:
-    """Return a whole number where a text is one, else the text."""
-    try:
-        return int(text)
+        return kind(text)
     except ValueError:
         return text
 

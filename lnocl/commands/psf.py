@@ -6,6 +6,7 @@ import argparse
 import math
 import os
 from collections.abc import Mapping, Sequence
+from functools import partial
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
@@ -14,7 +15,7 @@ from numpy.typing import NDArray
 
 from lnocl.commands import options, pictures, record
 from lnocl.commands.declared import SATURATION
-from lnocl.commands.options import number_or_word, option
+from lnocl.commands.options import option, or_word
 from lnocl.commands.parser import Command
 from lnocl.errors import InputError, counted
 
@@ -80,7 +81,7 @@ OPTIONS = [
     ),
     option(
         "--background",
-        type=number_or_word,
+        type=partial(or_word, float),
         default="auto",
         metavar="VALUE",
         card=("BKG", "background subtracted, unit of the frame"),
