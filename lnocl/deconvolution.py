@@ -13,12 +13,7 @@ from numpy.typing import ArrayLike
 
 from lnocl.checkpoint import Checkpointer
 from lnocl.core.runs.inputs import describe
-from lnocl.core.runs.options import (
-    EngineName,
-    Precision,
-    StopName,
-    check_types,
-)
+from lnocl.core.runs.options import EngineName, Precision, StopName, check_types
 from lnocl.core.runs.outcome import Outcome
 from lnocl.core.runs.plan import HALOS, LEVELS, PSFS, STARS, Plan
 from lnocl.core.runs.plan import plan as make_plan

@@ -11,6 +11,7 @@ import re
 import sys
 import warnings
 from collections.abc import Callable
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -165,6 +166,20 @@ def refuse_not_finite(*sums: float) -> None:
             "the objective is infinite or not a number: scale the scene where its values are large "
             "beyond measure; else see what lnocl selftest says of the device"
         )
+
+
+def installed(module: str, why: str) -> Any:
+    """Return a module that is not part of every installation.
+
+    Raises
+    ------
+    LnoclError
+        It is missing; the message says why it is needed, and how to install it.
+    """
+    try:
+        return import_module(module)
+    except ImportError:
+        raise LnoclError(f"{why}: pip install {module.partition('.')[0]}") from None
 
 
 def counted(n: int, noun: str) -> str:

@@ -14,7 +14,7 @@ from contextlib import closing, contextmanager, suppress
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeVar
 
 from lnocl import process
-from lnocl.errors import InputError, LnoclError, counted
+from lnocl.errors import InputError, LnoclError, counted, installed
 
 if TYPE_CHECKING:
     from distributed import Client, Future, LocalCluster, as_completed
@@ -64,14 +64,8 @@ def check_parallel(parallel: object) -> None:
             f"`parallel` must be True, False, a number of processes or {CURRENT!r}; {parallel!r} "
             "was given"
         )
-    if parallel is False:
-        return
-    try:
-        import distributed  # noqa: F401
-    except ImportError:
-        raise LnoclError(
-            "`parallel` needs Dask; install it with: pip install distributed"
-        ) from None
+    if parallel is not False:
+        installed("distributed", "`parallel` needs Dask; install it with")
 
 
 def work(
@@ -161,12 +155,8 @@ def close_cluster(cluster: LocalCluster) -> None:
 
     A busy machine takes its time to end workers that have nothing to do: that is not warned of.
     """
-    nanny = logging.getLogger("distributed.nanny")
-    level = nanny.level
-    nanny.setLevel(logging.ERROR)
-    with suppress(KeyError):
+    with process.ignored_notes("distributed.nanny", logging.ERROR), suppress(KeyError):
         cluster.close()
-    nanny.setLevel(level)
 
 
 def _refuse_a_script_without_guard() -> None:

@@ -35,12 +35,12 @@ def ignored_warnings(category: type[Warning] = Warning) -> Iterator[None]:
 
 
 @contextmanager
-def ignored_notes() -> Iterator[None]:
-    """Leave the notes of the log unsaid."""
-    log = logging.getLogger("lnocl")
+def ignored_notes(name: str = "lnocl", least: int = logging.WARNING) -> Iterator[None]:
+    """Leave the notes of a log unsaid that are below a level."""
+    log = logging.getLogger(name)
     with LOCK:
         level = log.level
-        log.setLevel(logging.WARNING)
+        log.setLevel(least)
         try:
             yield
         finally:

@@ -7,6 +7,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable
+from contextlib import AbstractContextManager
 from contextvars import ContextVar
 from typing import Any
 
@@ -22,7 +23,7 @@ FIRST_LINE, LINE_INTERVAL, CLOCK_INTERVAL = 1.5, 60.0, 0.5
 HIDDEN = ContextVar("hidden", default=False)
 
 
-class Progress:
+class Progress(AbstractContextManager["Progress"]):
     """The progress of one phase; its clock also ticks while a step takes long.
 
     Parameters
@@ -56,11 +57,10 @@ class Progress:
         if self._bar is not None:
             _CLOCK.begin(self)
 
-    def __enter__(self) -> Progress:
-        return self
-
     def __exit__(self, *exception: object) -> None:
-        self.close()
+        if self._bar is not None:
+            _CLOCK.end(self)
+            self._bar.close()
 
     def update(self, n: int = 1, words: str = "") -> None:
         """Count steps that are done, and show a few words beside the bar."""
@@ -80,12 +80,6 @@ class Progress:
         if self._is_lines or (self._bar is not None and is_due):
             self.update(n - self.n, "" if self._is_lines else quantity())
             self._shown = time.monotonic()
-
-    def close(self) -> None:
-        """End it."""
-        if self._bar is not None:
-            _CLOCK.end(self)
-            self._bar.close()
 
     def tick(self, is_due: bool) -> bool:
         """Show the time that has passed; return whether a line was due, and is in the log."""

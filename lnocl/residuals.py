@@ -75,11 +75,7 @@ class Fit(NamedTuple):
 
     def plus(self, other: Fit) -> Fit:
         """Return the fit of these pixels and others."""
-        return Fit(
-            self.n_pixels + other.n_pixels,
-            self.square_sum + other.square_sum,
-            self.variance + other.variance,
-        )
+        return Fit._make(one + more for one, more in zip(self, other, strict=True))
 
     @property
     def rms(self) -> float:
@@ -231,11 +227,11 @@ def judge_stars(estimate: Estimate) -> list[StarResiduals]:
         The models are made in windows round its stars alone.
     """
     found, scene = [], estimate.scene
-    width = min(fwhm(psf) for psf in scene.observation.psfs) if scene.n_stars else 0.0
-    psfs = [psfs_on_detector(scene.observation, each) for each in scene.observation.star_psfs]
-    psfs += (
-        [psfs_on_detector(scene.observation)] if scene.n_stars else []
-    )  # the last, of all others
+    if not scene.n_stars:
+        return []
+    width = min(fwhm(psf) for psf in scene.observation.psfs)
+    own = scene.observation.star_psfs
+    psfs = [psfs_on_detector(scene.observation, each) for each in (*own, None)]  # None: of others
     on_pixels = on_sky(scene.stars, scene.oversample)
     n = scene.n_stars
     stars = zip(scene.stars, on_pixels, estimate.star_fluxes[:n], scene.shown[:n], strict=True)

@@ -441,7 +441,7 @@ def significance(outcome: Outcome, width: float, false_alarms: float) -> Signifi
             f"nowhere do the images tell a source of `width` {width:g} pixels from stars, the "
             "level of the sky and edges: give a narrower one, or a larger field"
         )
-    table = detections(outcome.estimate, outcome.moves, found, least, beside, null.resolution)
+    table = detections(outcome.estimate, outcome.moves, found, least, beside)
     of_star = fluxes_of_stars(outcome)[table["star"] - 1]
     for name in ("", "_error"):
         table[f"contrast{name}"] = table[f"flux{name}"].value / of_star

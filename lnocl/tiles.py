@@ -408,8 +408,7 @@ class _Mosaic:
         _, background = together(observation.images, observation.background)
         self._models = np.zeros(observation.images.shape) + background
         self._stars = np.zeros((len(self.given_positions), 6))
-        n = self.observation.n_epochs
-        self._covariances = np.zeros((len(self._stars) // n, n, n))
+        self._covariances = np.zeros((len(positions), n_epochs, n_epochs))
         self.found: list[_Found] = []
 
     def add(self, tile: Tile, found: _Found) -> None:

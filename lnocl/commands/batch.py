@@ -25,14 +25,14 @@ from lnocl.commands.parser import Command
 from lnocl.commands.signals import Terminated
 from lnocl.commands.targets import Target, read_targets
 from lnocl.errors import FileError, InputError, LnoclError, counted
+from lnocl.io import atomic
+from lnocl.parallel import Parallel, check_parallel, work
 from lnocl.progress import HIDDEN, Progress
 from lnocl.residuals import MUCH_HALO
 from lnocl.result.verdict import FITS
 
 if TYPE_CHECKING:
     from astropy.table import Table
-
-    from lnocl.parallel import Parallel
 
 SUMMARY = "summary.ecsv"
 # Lines of the table that is shown; the summary has all.
@@ -118,9 +118,10 @@ class Record:
 
 @dataclasses.dataclass(frozen=True)
 class Folder:
-    """The folder of the outputs."""
+    """The folder of the outputs, and that in which commands are run."""
 
     path: str
+    start: str
 
     def file(self, name: str, ending: str) -> str:
         """Return the path of an output of a target."""
@@ -140,59 +141,48 @@ class Folder:
 
     def write(self, record: Record) -> None:
         """Write the record of a target."""
-        from lnocl.io.atomic import write_text
-
         text = json.dumps(dataclasses.asdict(record), indent=1)
-        write_text(self.file(record.name, ".json"), text + "\n", overwrite=True)
+        atomic.write_text(self.file(record.name, ".json"), text + "\n", overwrite=True)
 
-    def state(self, target: Target, start: str) -> Record:
-        """Return the record of a target for the command of its row, given in a folder.
+    def new(self, target: Target, status: str, message: str = "") -> Record:
+        """Return a record for the command of a target's row."""
+        return Record(target.name, status, message, command=target.command, folder=self.start)
+
+    def state(self, target: Target) -> Record:
+        """Return the record of a target for the command of its row.
 
         That is its record; that it fails, where its outputs are of something else; or that it is
         waiting.
         """
-        new = Record(target.name, WAITING, command=target.command, folder=start)
         if target.fault:
-            return dataclasses.replace(new, status=FAILED, message=target.fault)
-        record = self.read(target.name)
-        is_its_own = record is not None and (record.command, record.folder) == (
-            target.command,
-            start,
-        )
+            return self.new(target, FAILED, target.fault)
+        new, record = self.new(target, WAITING), self.read(target.name)
         there = [e for e in (".fits", ".log") if os.path.exists(self.file(target.name, e))]
-        if record is not None and is_its_own:
+        if record and (record.command, record.folder) == (new.command, new.folder):
             return new if record.status == DONE and ".fits" not in there else record
-        taken = ".fits" in there or (bool(there) and record is None)
-        if not taken:
+        if not there or (record and ".fits" not in there):
             return new
+        of = "is of another command" if record else "exists"
         output = self.file(target.name, there[0])
-        of = "is of another command" if record is not None else "exists"
-        return dataclasses.replace(
-            new, status=FAILED, message=f"{output} {of}; give another name, or --overwrite"
-        )
+        return self.new(target, FAILED, f"{output} {of}; give another name, or --overwrite")
 
 
-def _make_worker(folder: Folder, start: str) -> Callable[[Target], Record]:
-    """Return the function of a target; `start` is the folder in which its command is run."""
+def _make_worker(folder: Folder) -> Callable[[Target], Record]:
+    """Return the function of a target."""
     environment.prepare()
-    return partial(_do, folder, start)
+    return partial(_do, folder)
 
 
-def _do(folder: Folder, start: str, target: Target) -> Record:
+def _do(folder: Folder, target: Target) -> Record:
     """Deconvolve a target, with its log and its record; return that."""
-    new = Record(
-        target.name,
-        STARTED,
-        process=f"{socket.gethostname()}:{os.getpid()}",
-        command=target.command,
-        folder=start,
-    )
+    process = f"{socket.gethostname()}:{os.getpid()}"
+    new = dataclasses.replace(folder.new(target, STARTED), process=process)
     folder.write(new)
     output, log = folder.file(target.name, ".fits"), io.StringIO()
     words = ["deconvolve", *target.words, "-o", output, "--overwrite"]
     begun = time.perf_counter()
     with (
-        contextlib.chdir(start),
+        contextlib.chdir(folder.start),
         contextlib.redirect_stdout(log),
         contextlib.redirect_stderr(log),
     ):
@@ -213,7 +203,8 @@ def _do(folder: Folder, start: str, target: Target) -> Record:
         seconds=round(time.perf_counter() - begun, 3),
         **_found(log.getvalue(), output, status),
     )
-    _write_log(folder, record, log.getvalue())
+    text = f"$ cd {shlex.quote(record.folder)}; {record.command}\n{log.getvalue()}"
+    atomic.write_text(folder.file(record.name, ".log"), text, overwrite=True)
     folder.write(record)
     return record
 
@@ -248,31 +239,18 @@ def _found(log: str, output: str, status: int) -> dict[str, Any]:
     }
 
 
-def _write_log(folder: Folder, record: Record, log: str) -> None:
-    from lnocl.io.atomic import write_text
-
-    write_text(
-        folder.file(record.name, ".log"),
-        f"$ cd {shlex.quote(record.folder)}; {record.command}\n{log}",
-        overwrite=True,
-    )
-
-
 def _run(arguments: argparse.Namespace) -> Iterator[str]:
-    from lnocl.io import atomic
-    from lnocl.parallel import check_parallel
-
     check_parallel(arguments.parallel)
     targets = read_targets(arguments.targets)
     atomic.check_folder(arguments.output, overwrite=True)
-    folder, start = Folder(os.path.abspath(arguments.output)), os.getcwd()
+    folder = Folder(os.path.abspath(arguments.output), os.getcwd())
     with atomic.kept(path for each in targets for path in each.inputs):
         atomic.check_output(os.path.join(folder.path, SUMMARY), True)
         pictures.check(arguments)
         targets = [_apart(each, folder) for each in targets]
     i, n = arguments.array or (1, 1)
     own = targets[i - 1 :: n]
-    before = [folder.state(each, start) for each in own]
+    before = [folder.state(each) for each in own]
     n_old = sum(record.status == DONE for record in before)
     if arguments.overwrite:
         due, n_old = [each for each in own if not each.fault], 0
@@ -284,13 +262,13 @@ def _run(arguments: argparse.Namespace) -> Iterator[str]:
             if record.status != DONE and (record.status != FAILED or record.process)
         ]
     with (
-        running.written_as_done(partial(_write_summary, folder, targets, start)) as write_where_due,
+        running.written_as_done(partial(_write_summary, folder, targets)) as write_where_due,
         Progress(len(due), "target", not arguments.quiet) as bar,
     ):
-        for record in _records(folder, due, start, arguments.parallel):
+        for record in _records(folder, due, arguments.parallel):
             bar.update(words=f"{record.name} {record.status}")
             write_where_due()
-    summary = _summary(folder, targets, start)
+    summary = _summary(folder, targets)
     yield from _summarise(summary, n_old, folder)
     if arguments.plot is not None:
         from lnocl.plotting.batch import draw_batch
@@ -303,30 +281,23 @@ def _run(arguments: argparse.Namespace) -> Iterator[str]:
 
 def _apart(target: Target, folder: Folder) -> Target:
     """Return a target; one whose files would replace an input of any fails."""
-    from lnocl.io.atomic import refuse_input
-
     try:
         for ending in (".fits", ".log", ".json"):
-            refuse_input(folder.file(target.name, ending))
+            atomic.refuse_input(folder.file(target.name, ending))
     except InputError as error:
         return target._replace(fault=target.fault or error.message)
     return target
 
 
-def _records(
-    folder: Folder, targets: Sequence[Target], start: str, parallel: Parallel
-) -> Iterator[Record]:
+def _records(folder: Folder, targets: Sequence[Target], parallel: Parallel) -> Iterator[Record]:
     """Yield the record of each target as it is done."""
-    from lnocl.parallel import work
-
     if not targets:
         return
-    make = partial(_make_worker, folder, start)
+    make = partial(_make_worker, folder)
 
     def give_up(target: Target, why: str) -> Record:
-        record = dataclasses.replace(
-            folder.state(target, start), status=FAILED, message=why, process="lost"
-        )
+        record = folder.state(target)
+        record = dataclasses.replace(record, status=FAILED, message=why, process="lost")
         folder.write(record)
         return record
 
@@ -334,20 +305,20 @@ def _records(
         yield from records
 
 
-def _summary(folder: Folder, targets: Sequence[Target], start: str) -> Table:
+def _summary(folder: Folder, targets: Sequence[Target]) -> Table:
     """Return what became of all targets, those of other processes too."""
     from astropy.table import Table
 
-    records = [folder.state(each, start) for each in targets]
+    records = [folder.state(each) for each in targets]
     summary = Table([dataclasses.asdict(each) for each in records])
     summary["seconds"].unit = "s"
     return summary
 
 
-def _write_summary(folder: Folder, targets: Sequence[Target], start: str) -> None:
+def _write_summary(folder: Folder, targets: Sequence[Target]) -> None:
     from lnocl.io.tables import write_table
 
-    write_table(_summary(folder, targets, start), folder.file(SUMMARY, ""), "targets", True)
+    write_table(_summary(folder, targets), folder.file(SUMMARY, ""), "targets", True)
 
 
 def _summarise(summary: Table, n_old: int, folder: Folder) -> list[str]:

@@ -6,14 +6,11 @@ import argparse
 import contextlib
 import os
 import signal
-from typing import TYPE_CHECKING
 
 from lnocl.commands.signals import ENDING, first_handled
 from lnocl.errors import InputError, LnoclError, counted
 from lnocl.io import atomic
-
-if TYPE_CHECKING:
-    from lnocl.result import Result
+from lnocl.result import Result
 
 SIGNALS = (signal.SIGINT, *ENDING)
 
@@ -34,7 +31,7 @@ class RunInterruptedError(LnoclError):
     """A run that a signal has ended; its result is written."""
 
 
-class Interrupts:
+class Interrupts(contextlib.AbstractContextManager["Interrupts"]):
     """Listens for signals from the first iteration on: the first one ends the run, the second all.
 
     After the last iteration a signal changes nothing: the result is complete, and is written.
@@ -49,9 +46,6 @@ class Interrupts:
         self.caught = 0
         self._listens = False
         self._listening = contextlib.ExitStack()
-
-    def __enter__(self) -> Interrupts:
-        return self
 
     def __exit__(self, *exception: object) -> None:
         self._listening.close()

@@ -4,45 +4,19 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
+from importlib import import_module
 
 from lnocl import loading
-from lnocl.commands import (
-    batch,
-    bench,
-    deconvolve,
-    demo,
-    detect,
-    devices,
-    environment,
-    errors,
-    limit,
-    messages,
-    plot,
-    psf,
-    report,
-    running,
-    selftest,
-    simulate,
-    stars,
-)
-from lnocl.commands.parser import Parser
+from lnocl.commands import environment, messages, running
+from lnocl.commands.parser import Command, Parser
 
-# In the order of the help.
-COMMANDS = {
-    "deconvolve": deconvolve.COMMAND,
-    "batch": batch.COMMAND,
-    "errors": errors.COMMAND,
-    "detect": detect.COMMAND,
-    "limit": limit.COMMAND,
-    "psf": psf.COMMAND,
-    "stars": stars.COMMAND,
-    "plot": plot.COMMAND,
-    "report": report.COMMAND,
-    "demo": demo.COMMAND,
-    "simulate": simulate.COMMAND,
-    "bench": bench.COMMAND,
-    "devices": devices.COMMAND,
-    "selftest": selftest.COMMAND,
+# The subcommands in the order of the help, each in the module of its name.
+NAMES = (
+    *("deconvolve", "batch", "errors", "detect", "limit", "psf", "stars", "plot", "report"),
+    *("demo", "simulate", "bench", "devices", "selftest"),
+)
+COMMANDS: dict[str, Command] = {
+    name: import_module(f"lnocl.commands.{name}").COMMAND for name in NAMES
 }
 
 

@@ -6,17 +6,10 @@ import inspect
 import re
 import sys
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import Any, Literal, get_args, get_origin
 
-from lnocl.commands.options import (
-    EITHER,
-    SEVERAL,
-    Option,
-    finite,
-    number_or_word,
-    option,
-    whole_or_word,
-)
+from lnocl.commands.options import EITHER, SEVERAL, Option, finite, option, or_word
 from lnocl.deconvolution import deconvolve
 from lnocl.io.calibration import Calibration
 
@@ -72,9 +65,9 @@ def _conversion(hint: Any) -> Mapping[str, Any]:
         # Neither flag is the word, which is the default.
         return {"action": EITHER, "default": None} if has_words else {"action": "store_true"}
     if float in kinds:
-        return {"type": number_or_word if has_words else float}
+        return {"type": partial(or_word, float) if has_words else float}
     if int in kinds:
-        return {"type": whole_or_word if has_words else int, "metavar": "N"}
+        return {"type": partial(or_word, int) if has_words else int, "metavar": "N"}
     return {}
 
 

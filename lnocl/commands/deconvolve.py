@@ -19,6 +19,7 @@ from lnocl.errors import InputError, MisfitWarning, detail, warn
 from lnocl.progress import Progress
 from lnocl.result import Callback, Result, view_of
 from lnocl.result.summary import Unit, details, summary_lines
+from lnocl.tiles import deconvolve_tiles, for_the_whole
 
 if TYPE_CHECKING:
     from lnocl.core.scene.observation import Observation
@@ -70,8 +71,6 @@ def solve(
 
 def in_tiles(arguments: argparse.Namespace, observation: Observation) -> bool:
     """Return whether a run is tile by tile, as is asked for, or as PSFs that vary may be."""
-    from lnocl.tiles import for_the_whole
-
     varies = bool(observation.psf_fields)
     return arguments.tile is not None or (varies and for_the_whole(observation) is None)
 
@@ -80,8 +79,6 @@ def _solve_tiles(
     arguments: argparse.Namespace, observation: Observation, parameters: dict[str, Any]
 ) -> Result:
     """Run tile by tile; refuse what is for one run alone."""
-    from lnocl.tiles import deconvolve_tiles
-
     for name in ("checkpoint", "resume"):
         if parameters.pop(name, None) is not None:
             raise InputError(f"`{name}` is not for tiles; leave it out")

@@ -15,10 +15,6 @@ def prepare() -> None:
     astropy fails to import without a home; with one that cannot be read it uses its defaults.
     matplotlib then makes a temporary folder, and its message about that is hidden.
     """
-    try:
-        is_known = os.path.isabs(os.path.expanduser("~"))
-    except (KeyError, RuntimeError):
-        is_known = False
-    if not is_known:
+    if not os.path.isabs(os.path.expanduser("~")):
         os.environ["HOME"] = NO_HOME
     logging.getLogger("matplotlib").setLevel(logging.ERROR)

@@ -65,12 +65,10 @@ def _run(arguments: argparse.Namespace) -> list[str]:
     check_parallel(arguments.parallel)
     check_number(arguments.bootstrap, arguments.seed)
     again = RerunOfFile.read(arguments.result, arguments.quiet)
-    parts = _parts(arguments, again.frames)
-    if not arguments.overwrite:
-        _check_seed(arguments.result, arguments.seed)
+    parts, before = _parts(arguments, again.frames), _replicas_before(arguments)
     outcome = again.outcome()
     with ignored_notes():
-        lines = _add_errors(arguments, outcome, again, parts)
+        lines = _add_errors(arguments, outcome, again, parts, before)
     return [*lines, f"added to {arguments.result}"]
 
 
@@ -94,6 +92,7 @@ def _add_errors(
     outcome: Outcome,
     again: RerunOfFile,
     parts: Sequence[Part],
+    before: Held | None,
 ) -> list[str]:
     """Add the errors of a result to its file, as replicas are done; return what to say of them.
 
@@ -107,9 +106,10 @@ def _add_errors(
         The file, and what its result was made of.
     parts : list of Aperture or Profile
         Regions and profiles that are measured.
+    before : Held or None
+        Replicas that the file has.
     """
     from lnocl.core.runs.bootstrap import bootstrap, without_replicas
-    from lnocl.io.fitserrors import read_replicas
 
     seed, frames = arguments.seed, again.frames
     latest: list[Bootstrap] = []
@@ -118,13 +118,14 @@ def _add_errors(
         for found in latest:
             _write(again, found, parts, before)
 
-    expected = without_replicas(outcome, parts, seed)
-    before = earlier = None
-    if arguments.overwrite:
-        with contextlib.suppress(FileError):  # damaged ones
-            before = read_replicas(again.saved.path)
-    else:
-        earlier = _earlier(again.saved.path, expected, frames)
+    earlier = None
+    if before is not None and not arguments.overwrite:
+        expected = without_replicas(outcome, parts, seed)
+        if not _held(expected, frames).is_start_of(before):
+            raise _of_others(again.saved.path, before)
+        earlier = dataclasses.replace(
+            expected, errors=before.errors, of_psfs=before.of_psfs, sums=before.sums
+        )
     with written_as_done(write) as write_where_due:
 
         def look(found: Bootstrap) -> None:
@@ -136,8 +137,8 @@ def _add_errors(
     return _summarise(found, parts, frames)
 
 
-def _check_seed(path: str, seed: int) -> None:
-    """Refuse replicas in a file of another seed, before a run is made again.
+def _replicas_before(arguments: argparse.Namespace) -> Held | None:
+    """Return the replicas that a file has; refuse those of another seed, unless to begin anew.
 
     Raises
     ------
@@ -146,9 +147,12 @@ def _check_seed(path: str, seed: int) -> None:
     """
     from lnocl.io.fitserrors import read_replicas
 
-    held = read_replicas(path)
-    if held is not None and held.seed != seed:
-        raise _of_others(path, held)
+    with contextlib.suppress(*[FileError] * arguments.overwrite):  # as damaged ones are replaced
+        held = read_replicas(arguments.result)
+        if held is not None and held.seed != arguments.seed and not arguments.overwrite:
+            raise _of_others(arguments.result, held)
+        return held
+    return None
 
 
 def _of_others(path: str, held: Held) -> InputError:
@@ -158,18 +162,6 @@ def _of_others(path: str, held: Held) -> InputError:
         f"{path} has replicas with `seed` {held.seed} of {regions}: give the same `regions`, "
         "`profiles` and `seed`, or take `overwrite` to begin anew"
     )
-
-
-def _earlier(path: str, expected: Bootstrap, frames: Frames) -> Bootstrap | None:
-    """Return the replicas that a file has; refuse those of something else."""
-    from lnocl.io.fitserrors import read_replicas
-
-    held = read_replicas(path)
-    if held is None:
-        return None
-    if not _held(expected, frames).is_start_of(held):
-        raise _of_others(path, held)
-    return dataclasses.replace(expected, errors=held.errors, of_psfs=held.of_psfs, sums=held.sums)
 
 
 def _held(found: Bootstrap, frames: Frames) -> Held:

@@ -66,15 +66,7 @@ def in_shell(message: str, flags: Mapping[str, str]) -> str:
     return re.sub(r"(--[\w-]+)=", r"\1 ", typed)
 
 
-def show_warning(
-    flags: Mapping[str, str],
-    message: Warning | str,
-    category: type[Warning],
-    filename: str,
-    lineno: int,
-    file: TextIO | None = None,
-    line: str | None = None,
-) -> None:
+def show_warning(flags: Mapping[str, str], message: Warning | str, *_: object) -> None:
     """Write a warning to stderr, with `in_shell`, in place of `warnings.showwarning`."""
     _note(f"warning: {in_shell(_message_of(message), flags)}")
 
@@ -95,21 +87,17 @@ def recorded(flags: Mapping[str, str], shows: Callable[[Warning], bool]) -> Iter
         Given a warning, returns whether it is shown too.
     """
     lines: list[str] = []
-    show = warnings.showwarning
 
     def record(message: Warning | str, *where: Any, **more: Any) -> None:
         lines.append(f"warning: {in_shell(_message_of(message), flags)}")
         if isinstance(message, str) or shows(message):
             show(message, *where, **more)
 
-    warnings.showwarning = record
     notes = _Notes(flags, lines.append, logging.DEBUG)
     notes.addFilter(lambda record: not getattr(record, "is_passing", False))
-    try:
-        with _handled(LOG, notes):
-            yield lines
-    finally:
-        warnings.showwarning = show
+    with warnings.catch_warnings(), _handled(LOG, notes):
+        show, warnings.showwarning = warnings.showwarning, record
+        yield lines
 
 
 @contextlib.contextmanager
@@ -201,10 +189,6 @@ def _one_line(text: str, stream: TextIO) -> str:
     """Return text in one line, with escapes for characters that a terminal cannot show."""
     joined = " ".join(part.strip() for part in text.splitlines())
     joined = " " * (len(text) - len(text.lstrip(" "))) + joined
-    shown = "".join(c if c.isprintable() else _escape(c) for c in joined)
+    shown = "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in joined)
     encoding = stream.encoding or "ascii"
     return shown.encode(encoding, "backslashreplace").decode(encoding)
-
-
-def _escape(character: str) -> str:
-    return character.encode("unicode_escape").decode("ascii")

@@ -41,7 +41,7 @@ class Option:
     checksum : str
         Keyword of the cards with the checksums of its files.
     is_input : bool
-        Whether a text that it is given may be the name of a file to read.
+        Whether a text that it is given may be the name of a file to read, as with a checksum.
     kinds : mapping of str to str
         The kinds of its values, ``KIND=FILE``, with the parameter that each stands for.
     is_repeated : bool
@@ -102,19 +102,11 @@ class Option:
         value = values.get(self.keywords.get("nargs", ""), metavar)
         return value if self.is_positional else f"{self.flags[0]} {value}"
 
-    def but(
-        self,
-        flags: tuple[str, ...] = (),
-        needs: tuple[str, ...] | None = None,
-        **keywords: Any,
-    ) -> Option:
-        """Return the same option with other flags, needs, or keywords, such as its help."""
-        return dataclasses.replace(
-            self,
-            flags=flags or self.flags,
-            keywords={**self.keywords, **keywords},
-            needs=self.needs if needs is None else needs,
-        )
+    def but(self, *flags: str, **given: Any) -> Option:
+        """Return the same option with other flags, attributes, or keywords, such as its help."""
+        own, keywords = _apart(given)
+        keywords = {**self.keywords, **keywords}
+        return dataclasses.replace(self, flags=flags or self.flags, keywords=keywords, **own)
 
     def words(self, value: Any) -> list[str]:
         """Return the words of a command line that give it a value; None gives no words."""
@@ -122,12 +114,9 @@ class Option:
         action = self.keywords.get("action")
         if action in SWITCHES:
             return flag if value is SWITCHES[action] else []
-        if action is EITHER and value is self.default:
-            return []
-        if action is EITHER and value is False:
-            return [self.flags[0].replace("--", "--no-", 1)]
         if action is EITHER:
-            return flag if value else []
+            off = [self.flags[0].replace("--", "--no-", 1)]
+            return [] if value in (self.default, None) else flag if value else off
         values = _listed(value)
         if action == "append":
             return [word for each in values for word in (*flag, _word(each))]
@@ -135,7 +124,8 @@ class Option:
 
     def inputs(self, value: Any) -> list[str]:
         """Return the names in a value that may be those of files to read."""
-        words = [word for word in _listed(value) if self.is_input and isinstance(word, str)]
+        is_input = self.is_input or bool(self.checksum)
+        words = [word for word in _listed(value) if is_input and isinstance(word, str)]
         return [parse_kind(word)[1] for word in words] if self.kinds else words
 
 
@@ -143,21 +133,18 @@ class Option:
 Options = Mapping[str, Sequence[Option]]
 
 
-def option(
-    *flags: str,
-    card: tuple[str, str] | None = None,
-    checksum: str = "",
-    is_input: bool = False,
-    is_repeated: bool = True,
-    kinds: Mapping[str, str] | None = None,
-    needs: tuple[str, ...] = (),
-    **keywords: Any,
-) -> Option:
-    """Return an `Option`; all further keywords are for the parser."""
-    if kinds is not None:
+def option(*flags: str, **given: Any) -> Option:
+    """Return an `Option` with the attributes that are given, and other keywords for the parser."""
+    own, keywords = _apart(given)
+    if kinds := own.get("kinds"):
         keywords = {"type": partial(_of_kind, kinds), "metavar": "KIND=FILE", **keywords}
-    is_input = is_input or bool(checksum)
-    return Option(flags, keywords, card, checksum, is_input, is_repeated, kinds or {}, needs)
+    return Option(flags, keywords, **own)
+
+
+def _apart(given: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Return which keywords are attributes of an option, and which are for the parser."""
+    own = given.keys() & {each.name for each in dataclasses.fields(Option)}
+    return {name: given[name] for name in own}, {k: given[k] for k in given.keys() - own}
 
 
 def _of_kind(kinds: Mapping[str, str], word: str) -> str:
@@ -195,18 +182,10 @@ def _word(value: Any) -> str:
     return ",".join(map(repr, value if isinstance(value, tuple) else (value,)))
 
 
-def number_or_word(text: str) -> float | str:
-    """Return a number where a text is one, else the text."""
+def or_word(kind: type[float] | type[int], text: str) -> float | str:
+    """Return a number, or a whole one, where a text is one, else the text."""
     try:
-        return float(text)
-    except ValueError:
-        return text
-
-
-def whole_or_word(text: str) -> int | str:
-    """Return a whole number where a text is one, else the text."""
-    try:
-        return int(text)
+        return kind(text)
     except ValueError:
         return text
 

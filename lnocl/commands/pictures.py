@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import argparse
 import os
-from typing import TYPE_CHECKING
 
 from lnocl.errors import InputError
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+from lnocl.io import atomic
+from lnocl.plotting.figure import Figure, check_matplotlib, save_figure
 
 
 def check(arguments: argparse.Namespace) -> None:
@@ -26,9 +24,6 @@ def check(arguments: argparse.Namespace) -> None:
     """
     if arguments.plot is None:
         return
-    from lnocl.io import atomic
-    from lnocl.plotting.figure import check_matplotlib
-
     if not arguments.plot.lower().endswith(".png"):
         raise InputError(
             f"the picture is a PNG file; give --plot a name ending in .png, not {arguments.plot}"
@@ -42,7 +37,5 @@ def check(arguments: argparse.Namespace) -> None:
 
 def draw(arguments: argparse.Namespace, figure: Figure) -> str:
     """Write the picture, and return a line that names its file."""
-    from lnocl.plotting.figure import save_figure
-
     save_figure(figure, arguments.plot, arguments.overwrite)
     return f"drew {arguments.plot}"

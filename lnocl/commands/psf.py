@@ -6,6 +6,7 @@ import argparse
 import math
 import os
 from collections.abc import Mapping, Sequence
+from functools import partial
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
@@ -14,7 +15,7 @@ from numpy.typing import NDArray
 
 from lnocl.commands import options, pictures, record
 from lnocl.commands.declared import SATURATION
-from lnocl.commands.options import number_or_word, option
+from lnocl.commands.options import option, or_word
 from lnocl.commands.parser import Command
 from lnocl.errors import InputError, counted
 
@@ -56,7 +57,7 @@ OPTIONS = [
     ),
     options.STAR_TABLE,
     options.STARS.but(
-        ("--without",),
+        "--without",
         needs=("star_table",),
         dest="without",
         help="position of a star of --stars that is not taken, such as your target with what "
@@ -80,7 +81,7 @@ OPTIONS = [
     ),
     option(
         "--background",
-        type=number_or_word,
+        type=partial(or_word, float),
         default="auto",
         metavar="VALUE",
         card=("BKG", "background subtracted, unit of the frame"),
@@ -360,14 +361,9 @@ def _result_cards(stars: Sequence[StarPsf]) -> list[Card]:
 def _figure(arguments: argparse.Namespace, stars: Sequence[StarPsf]) -> Figure:
     from lnocl.plotting.psf import draw_star_psf
 
-    first = stars[0]
-    return draw_star_psf(
-        first.frame - first.background,
-        first.bad,
-        first.centres,
-        [star.psf for star in stars],
-        arguments.rotate,
-    )
+    first, psfs = stars[0], [star.psf for star in stars]
+    light = first.frame - first.background
+    return draw_star_psf(light, first.bad, first.centres, psfs, arguments.rotate)
 
 
 COMMAND = Command(

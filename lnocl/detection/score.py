@@ -61,17 +61,8 @@ SOME_LEVEL = 0.1
 LEFT, LEFT_BY_LEVEL, SEEN = 0.5, 0.2, 0.05
 # Width of rings round stars, resolutions.
 RING = 1.0
-# What the PSF of a place enters, and places alone.
-OF_PLACES = (
-    "values",
-    "score",
-    "information",
-    "variance",
-    "skewness",
-    "of_psfs",
-    "starlit",
-    "curvature",
-)
+# Of a score, what is not of each place's own PSF.
+OF_ALL = "is_tested", "correlation", "foremost"
 
 
 class Score(NamedTuple):
@@ -308,7 +299,7 @@ class Null:
             terms = zip(shares, (getattr(part, name) for part in parts), strict=True)
             return np.asarray(sum(np.where(share, value, 0.0) * share for share, value in terms))
 
-        of_places: dict[str, Any] = {name: mixed(name) for name in OF_PLACES}
+        of_places: dict[str, Any] = {n: mixed(n) for n in Score._fields if n not in OF_ALL}
         found = found._replace(**of_places)
         return found._replace(is_tested=np.isfinite(found.variance))
 

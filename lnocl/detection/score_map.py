@@ -99,7 +99,7 @@ class ScoreMap:
         found[at] = needed(values[at], skewness, probability) * self.errors[at]
         return found
 
-    def light_round(self, place: Array, value: float, resolution: float) -> float:
+    def light_round(self, place: Array, value: float) -> float:
         """Return the largest value in a ring round a place, less a point of a value that is there.
 
         Parameters
@@ -108,10 +108,8 @@ class ScoreMap:
             (x, y), pixels of the sky.
         value : float
             In units of the noise.
-        resolution : float
-            Pixels of the sky.
         """
-        rows, columns = self.values.shape
+        (rows, columns), resolution = self.values.shape, self.null.resolution
         half = math.ceil(ROUND * resolution) + 1
         x, y = np.round(place).astype(int).tolist()
         side = np.arange(-half, half + 1)

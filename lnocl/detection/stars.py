@@ -16,7 +16,7 @@ from lnocl.detection.checks import read_image, read_psf
 from lnocl.detection.defects import are_counts, saturated_pixels, sharpest_psf
 from lnocl.detection.maxima import SIGNIFICANT
 from lnocl.detection.search import PointSources, around, find_points, in_boxes, pixels_at
-from lnocl.errors import InputError, LnoclError, warn
+from lnocl.errors import InputError, installed, warn
 from lnocl.process import ignored_warnings
 
 if TYPE_CHECKING:
@@ -140,7 +140,9 @@ def find_stars(
     >>> print(len(stars), stars["x"][0].round(1), stars["y"][0].round(1))
     1 30.2 20.0
     """
-    _require_photutils()
+    installed(
+        "photutils.background", "the sky under stars is found by photutils, which is not installed"
+    )
     image, unit = split("image", image)
     threshold = in_unit("threshold", threshold, "")
     if saturation is not None:
@@ -188,16 +190,6 @@ def _outside(pixels: Array) -> Mask:
     if not empty.any() or are_counts(pixels[np.isfinite(pixels)]) or not pixels.any():
         return np.zeros(pixels.shape, bool)
     return ndimage.binary_opening(empty, np.ones((3, 3)))
-
-
-def _require_photutils() -> None:
-    try:
-        import photutils.background  # noqa: F401
-    except ImportError:
-        raise LnoclError(
-            "the sky under stars is found by photutils, which is not installed: pip install "
-            "photutils"
-        ) from None
 
 
 def _above_sky(pixels: Array, bad: Mask, width: float) -> tuple[Array, Array]:

@@ -68,12 +68,7 @@ def points_beside_stars(
 
 
 def detections(
-    estimate: Estimate,
-    moves: bool,
-    found: ScoreMap,
-    least: float,
-    beside: Sequence[Companion],
-    resolution: float,
+    estimate: Estimate, moves: bool, found: ScoreMap, least: float, beside: Sequence[Companion]
 ) -> QTable:
     """Return the table of `lnocl.significance.Significance`.
 
@@ -89,8 +84,6 @@ def detections(
         The threshold.
     beside : sequence of Companion
         These points.
-    resolution : float
-        Pixels of the sky.
     """
     from astropy.table import QTable
     from astropy.units import electron, pix
@@ -110,7 +103,7 @@ def detections(
     for i, place in enumerate(places):
         if found.width:
             kinds[i] = EXTENDED
-        elif is_steep[i] or found.light_round(place, values[i], resolution) > CLEAR:
+        elif is_steep[i] or found.light_round(place, values[i]) > CLEAR:
             fluxes[i], errors[i] = point_flux(estimate, pixels[i], fluxes[i], moves, raised)
             kinds[i] = POINT_SOURCE if fluxes[i] > CLEAR * errors[i] else EXTENDED
     # Of a maximum between pixels the place errs by its noise, and by how it is interpolated.

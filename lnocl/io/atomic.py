@@ -351,10 +351,8 @@ def _open_or_make(path: str) -> int:
 
 
 def _is_same(one: os.stat_result, other: os.stat_result) -> bool:
-    return os.path.samestat(one, other) and (one.st_size, one.st_mtime_ns) == (
-        other.st_size,
-        other.st_mtime_ns,
-    )
+    names = "st_dev", "st_ino", "st_size", "st_mtime_ns"
+    return all(getattr(one, name) == getattr(other, name) for name in names)
 
 
 def _lock(file: int, shared: bool = False) -> bool:

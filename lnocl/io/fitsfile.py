@@ -9,6 +9,7 @@ import io
 import os
 import stat
 from collections.abc import Iterator
+from dataclasses import dataclass
 from typing import IO, Any
 
 import numpy as np
@@ -21,6 +22,7 @@ from lnocl.io.packed import BLOCK, Blocks, check_sizes, copy_bytes, fits_content
 from lnocl.process import recorded_warnings
 
 
+@dataclass
 class FitsFile:
     """A FITS file that `open_fits` has opened.
 
@@ -38,17 +40,11 @@ class FitsFile:
         Bytes of the content.
     """
 
-    def __init__(
-        self,
-        path: str,
-        stream: io.BufferedReader,
-        content: IO[bytes],
-        hdus: fits.HDUList,
-        length: int,
-    ) -> None:
-        self.path = path
-        self._stream, self._content, self._hdus = stream, content, hdus
-        self._length = length
+    path: str
+    _stream: io.BufferedReader
+    _content: IO[bytes]
+    _hdus: fits.HDUList
+    _length: int
 
     def hdus(self) -> Iterator[Any]:
         """Yield the HDUs, each after a check that the file holds as much as its header claims.

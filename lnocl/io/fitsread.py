@@ -15,10 +15,10 @@ from lnocl.core.scene.transforms import enlarged
 from lnocl.errors import FileError, InputError, counted, detail, note, warn
 from lnocl.io.encoded import linear
 from lnocl.io.fitsfile import open_fits
-from lnocl.io.headers import finer_cards, make_wcs, quiet_log, readable
+from lnocl.io.headers import finer_cards, make_wcs, readable
 from lnocl.io.names import parse_name
 from lnocl.io.selection import choose, describe, find, has_pixels, name_of, only
-from lnocl.process import ignored_warnings
+from lnocl.process import ignored_notes, ignored_warnings
 
 # Beginnings of CTYPE3 of cubes whose planes are not of one sky: colours, energies, velocities,
 # polarisations.
@@ -246,7 +246,7 @@ def wcs_cards(header: fits.Header) -> fits.Header:
         try:
             # Cards that astropy mends on reading are written mended.
             wcs = make_wcs(header, key or " ")
-            with ignored_warnings(), quiet_log():
+            with ignored_warnings(), ignored_notes("astropy"):
                 if key and not wcs.wcs.ctype[0].endswith("-SIP"):
                     wcs.sip = None  # that of the primary system, which astropy gives to all
                 cards.update(wcs.to_header(relax=True))
@@ -297,15 +297,11 @@ def _read_file(
 
 
 def _check_shape(
-    path: str,
-    shape: tuple[int, ...],
-    first_path: str,
-    first_shape: tuple[int, ...],
-    alone: bool,
+    path: str, shape: tuple[int, ...], first_path: str, first_shape: tuple[int, ...], alone: bool
 ) -> None:
-    found = f"{path} has an image of {counted(len(shape), 'dimension')}"
-    if alone and len(shape) not in (2, 3):
-        raise InputError(f"{found}; two are needed, or three for a cube of images: cut the others")
+    if len(shape) not in (2, 3):
+        needed = "two are needed" + ", or three for a cube of images: cut the others" * alone
+        raise InputError(f"{path} has an image of {counted(len(shape), 'dimension')}; {needed}")
     if are_colours(shape):
         raise InputError(
             f"{path} has the shape {shape}: its last axis is of colours or channels; give one of "
@@ -316,8 +312,6 @@ def _check_shape(
             f"{path} holds {shape[0]} images, such as integrations; each of several files needs "
             "one: give their mean, or one of them"
         )
-    if not alone and len(shape) != 2:
-        raise InputError(f"{found}; two are needed")
     if shape != first_shape:
         raise InputError(
             f"{path} has the shape {shape} and {first_path} {first_shape}; they must be the same"

@@ -162,17 +162,14 @@ def place_cards(transforms: ArrayLike) -> list[Card]:
     """
     maps = np.asarray(transforms).reshape(-1, 2, 3)
     cards: list[Card] = [
-        (f"OFF{axis}{j}", float(offset), "offset of the image, pixels")
-        for j, each in enumerate(maps, 1)
-        for axis, offset in zip("XY", each[:, 2], strict=True)
+        (f"OFF{'XY'[axis]}{j + 1}", float(offset), "offset of the image, pixels")
+        for (j, axis), offset in np.ndenumerate(maps[:, :, 2])
     ]
     if (maps[:, :, :2] == np.eye(2)).all():
         return cards
     return cards + [
-        (f"R{a + 1}{b + 1}_{j}", float(each[a, b]), "rotation of the image")
-        for j, each in enumerate(maps, 1)
-        for a in (0, 1)
-        for b in (0, 1)
+        (f"R{a + 1}{b + 1}_{j + 1}", float(value), "rotation of the image")
+        for (j, a, b), value in np.ndenumerate(maps[:, :, :2])
     ]
 
 

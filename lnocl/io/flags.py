@@ -74,9 +74,7 @@ def bad_pixels(flags: NDArray[Any], good_bits: str, path: str) -> NDArray[np.boo
     # Which takes its time to load.
     from astropy.nddata.bitmask import bitfield_to_boolean_mask, interpret_bit_flags
 
-    are_whole = np.isfinite(flags).all() and (np.floor(flags) == flags).all()
-    sums = np.array(flags).astype(np.int64) if are_whole else None
-    if sums is None:
+    if not (np.isfinite(flags).all() and (np.floor(flags) == flags).all()):
         raise InputError(
             f"the extension DQ of {path} does not hold whole numbers; give `mask` as a file"
         )
@@ -89,4 +87,5 @@ def bad_pixels(flags: NDArray[Any], good_bits: str, path: str) -> NDArray[np.boo
             f"`mask` dq:{good_bits} names no flags; give powers of 2, as in dq:16,64, or dq:~1 for "
             "all but 1"
         )
+    sums = np.array(flags).astype(np.int64)
     return np.asarray(bitfield_to_boolean_mask(sums, ignore_flags=good), bool)

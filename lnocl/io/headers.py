@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-import contextlib
 import math
 import re
-from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
-import astropy
 from astropy.io import fits
 
 from lnocl.errors import InputError, note, warn
-from lnocl.process import ignored_warnings
+from lnocl.process import ignored_notes, ignored_warnings
 
 if TYPE_CHECKING:
     from astropy.wcs import WCS
@@ -144,16 +141,5 @@ def make_wcs(header: fits.Header, key: str = " ") -> WCS:
         header = header.copy()
         for keyword in [word for word in header if _TABLED.fullmatch(word)]:
             header.remove(keyword, ignore_missing=True, remove_all=True)
-    with ignored_warnings(), quiet_log():
+    with ignored_warnings(), ignored_notes("astropy"):  # such as on SIP coefficients
         return WCS(header, key=key, naxis=2)
-
-
-@contextlib.contextmanager
-def quiet_log() -> Iterator[None]:
-    """Keep astropy's notes, such as on SIP coefficients, from the terminal."""
-    level = astropy.log.level
-    astropy.log.setLevel("WARNING")
-    try:
-        yield
-    finally:
-        astropy.log.setLevel(level)

@@ -64,11 +64,9 @@ def mode(values: Array) -> tuple[float, float]:
 
     It is their median where the mean is far from that.
     """
-    from astropy.stats import sigma_clip
+    from astropy.stats import sigma_clipped_stats
 
-    clipped = sigma_clip(values, masked=False, axis=None)
-    held = clipped[np.isfinite(clipped)]
-    mean, median, scatter = (float(of(held)) for of in (np.mean, np.median, np.std))
+    mean, median, scatter = map(float, sigma_clipped_stats(values))
     is_skew = abs(mean - median) > SKEW * scatter
     return (median if is_skew else 2.5 * median - 1.5 * mean), scatter
 

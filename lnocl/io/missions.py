@@ -46,15 +46,12 @@ def calibrate(path: str, given: Mapping[str, Any]) -> dict[str, Any]:
     if telescope not in TELESCOPES:
         return {}
     found: dict[str, Any] = {}
-    held = contents.extensions
     if not (given.get("read_noise") or given.get("noise")):
-        found |= {"noise": [ERR]} if "ERR" in held else {"read_noise": ["auto"]}
-    if not given.get("mask") and (word := mask_word(contents)):
-        found["mask"] = [word]
-    if not given.get("background"):
-        found["background"] = ["auto"]
-    electrons = _electrons(path, contents, bool(given.get("gain")))
-    found |= {name: value for name, value in electrons.items() if not given.get(name)}
+        found = {"noise": [ERR]} if "ERR" in contents.extensions else {"read_noise": ["auto"]}
+    word = mask_word(contents)
+    found |= {"mask": [word] if word else [], "background": ["auto"]}
+    found |= _electrons(path, contents, bool(given.get("gain")))
+    found = {name: value for name, value in found.items() if value and not given.get(name)}
     for name, value in found.items():
         words = value if isinstance(value, str) else " ".join(value)
         note("%s: with %s %s, as for images of %s", path, name, words, telescope)
@@ -85,4 +82,4 @@ def _electrons(path: str, contents: Contents, has_gain: bool) -> dict[str, Any]:
         found["gain"] = keywords[0] if keywords else None
     if counts[1] and contents.value("EXPTIME"):
         found["exposure"] = ["EXPTIME"]
-    return {name: value for name, value in found.items() if value}
+    return found

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import os
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from astropy.io import fits
@@ -16,11 +16,9 @@ from lnocl.core.scene.transforms import rotations, scale_of
 from lnocl.core.scene.units import parse
 from lnocl.errors import FileError, InputError, counted, detail, note, warn
 from lnocl.io import sky
+from lnocl.io.calibration import Calibration, Word
 from lnocl.io.fitsfile import open_fits, open_regular
 from lnocl.io.fitsread import Stack, keyword_number, read_keyword
-
-if TYPE_CHECKING:
-    from lnocl.io.calibration import Calibration, Word
 
 # Most that is read of a file of angles.
 MAX_BYTES = 2**27

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from lnocl.errors import FileError, LnoclError
+from lnocl.errors import FileError, installed
 from lnocl.io.fitsread import read_contents
 
 # Of the headers of STDPSF files, and of the grids of STPSF (once WebbPSF).
@@ -27,13 +27,8 @@ def read_grid(path: str) -> Any:
     LnoclError
         photutils is not installed.
     """
+    psf = installed("photutils.psf", f"{path} holds a grid of PSFs, which photutils reads")
     try:
-        from photutils.psf import GriddedPSFModel
-    except ImportError:
-        raise LnoclError(
-            f"{path} holds a grid of PSFs, which photutils reads: pip install photutils"
-        ) from None
-    try:
-        return GriddedPSFModel.read(path)
+        return psf.GriddedPSFModel.read(path)
     except Exception as error:  # of its readers, which raise any
         raise FileError(f"{path} cannot be read as a grid of PSFs: {error}") from error

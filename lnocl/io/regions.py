@@ -6,19 +6,17 @@ import os
 import re
 import warnings
 from collections.abc import Iterable
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+from astropy.io import fits
 
 from lnocl.core.scene.apertures import Aperture, Profile
-from lnocl.errors import FileError, InputError, LnoclError, note
+from lnocl.core.scene.observation import Observation
+from lnocl.errors import FileError, InputError, installed, note
 from lnocl.io.fitsread import sky_header
 from lnocl.io.sky import celestial_wcs
-
-if TYPE_CHECKING:
-    from astropy.io import fits
-
-    from lnocl.core.scene.observation import Observation
+from lnocl.process import recorded_warnings
 
 # The share of a region that rounding may leave outside an image.
 ROUNDING = 1e-9
@@ -77,10 +75,7 @@ def read_apertures(
     InputError
         A region that encloses nothing, lies outside the image, or on the sky without coordinates.
     """
-    return [
-        _aperture(each.name, each.described, each.region, shape)
-        for each in _in_pixels(given, header)
-    ]
+    return [_aperture(each, shape) for each in _in_pixels(given, header)]
 
 
 def read_profiles(
@@ -136,13 +131,7 @@ def _in_pixels(given: Given, header: fits.Header | None) -> list[_Found]:
 
 
 def _regions() -> Any:
-    try:
-        import regions
-    except ImportError as error:
-        raise LnoclError(
-            "`regions` are read by the package regions: pip install regions"
-        ) from error
-    return regions
+    return installed("regions", "`regions` are read by the package regions")
 
 
 def _read(path: str) -> list[Any]:
@@ -150,8 +139,7 @@ def _read(path: str) -> list[Any]:
     if not os.path.isfile(path):
         raise FileError(f"{path} is not there: give a file of regions, such as DS9 writes")
     try:
-        with warnings.catch_warnings(record=True) as skipped:
-            warnings.simplefilter("always")
+        with recorded_warnings() as skipped:
             found = list(regions.Regions.read(path))
         if not found:
             return _read_without_frame(path)
@@ -205,15 +193,13 @@ def _profile(found: _Found, shape: tuple[int, int]) -> Profile:
     along, across = ((cos, sin), (-sin, cos)) if is_wide else ((-sin, cos), (cos, sin))
     n = max(round(length), 1)
     at = (np.arange(n) + 0.5) * length / n - length / 2.0
-    slices = []
+    slices, distances = [], []
     for distance in at:
         x, y = box.center.x + distance * along[0], box.center.y + distance * along[1]
         sides = (length / n, breadth) if is_wide else (breadth, length / n)
         part = regions.RectanglePixelRegion(regions.PixCoord(x, y), *sides, angle=box.angle)
-        slices.append(_aperture(found.name, found.described, part, shape))
-    distances = []
-    for each in slices:
-        y, x = each.places
+        slices.append(_aperture(found._replace(region=part), shape))
+        y, x = slices[-1].places
         distances.append((x - box.center.x) * across[0] + (y - box.center.y) * across[1])
     return Profile(found.name, at.tolist(), slices, distances)
 
@@ -230,7 +216,12 @@ def _refuse_outside(described: str, region: Any, shape: tuple[int, int]) -> None
     if box is None or not (
         -2 <= box.ixmin <= box.ixmax <= nx + 2 and -2 <= box.iymin <= box.iymax <= ny + 2
     ):
-        raise InputError(f"{described} lies outside the image of {nx} x {ny} pixels, or partly")
+        raise _outside(described, shape)
+
+
+def _outside(described: str, shape: tuple[int, int]) -> InputError:
+    ny, nx = shape
+    return InputError(f"{described} lies outside the image of {nx} x {ny} pixels, or partly")
 
 
 def _filled(region: Any, which: str) -> Any:
@@ -244,7 +235,8 @@ def _filled(region: Any, which: str) -> Any:
     return getattr(_regions(), kind + end)(region.center, *sides, **turned)
 
 
-def _aperture(name: str, described: str, region: Any, shape: tuple[int, int]) -> Aperture:
+def _aperture(found: _Found, shape: tuple[int, int]) -> Aperture:
+    region, name, described = found
     _refuse_outside(described, region, shape)
     outer, inner = _filled(region, "outer"), _filled(region, "inner")
     try:
@@ -262,9 +254,7 @@ def _aperture(name: str, described: str, region: Any, shape: tuple[int, int]) ->
     inside = mask.cutout(np.ones(shape), fill_value=0.0)
     total = weights.sum()
     if inside is None or (weights * (inside == 0)).sum() > ROUNDING * total:
-        raise InputError(
-            f"{described} lies outside the image of {shape[1]} x {shape[0]} pixels, or partly"
-        )
+        raise _outside(described, shape)
     if total == 0:
         raise InputError(f"{described} encloses no part of a pixel")
     rows, columns = np.flatnonzero(weights.any(axis=1)), np.flatnonzero(weights.any(axis=0))

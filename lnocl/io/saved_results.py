@@ -120,6 +120,27 @@ class SavedResult:
         """
         return number(self.path, self.header, keyword)
 
+    def _fault(self) -> str:
+        """Return why these are not the parts of a result; nothing where they are."""
+        if "STARS" not in self.tables:
+            return "there is no table STARS"
+        n_labels = len(self.epoch_labels)
+        n_epochs = int(np.max(self.tables["STARS"].get("epoch", 0.0), initial=0.0)) + 1
+        if n_labels != n_epochs and (n_labels or n_epochs > 1):
+            return f"EPOCHS has {n_labels} labels of {n_epochs} epochs"
+        if self.extended.ndim != 2:
+            return "the image is a cube"
+        oversample = self.number("OVERSAMP") or 1.0
+        if oversample not in OVERSAMPLES or any(n % oversample for n in self.extended.shape):
+            return f"OVERSAMP is {oversample:g}"
+        for name, cube in self.cubes.items():
+            shape = len(self.cubes["MODELS"]), *(int(n // oversample) for n in self.extended.shape)
+            if cube.shape != shape and (name, cube.shape) != ("ELECTRONS", (*shape[:1], 1, 1)):
+                return f"{name} has the shape {cube.shape}"
+        if self.doubtful is not None and self.doubtful.shape != self.extended.shape:
+            return f"DOUBTFUL has the shape {self.doubtful.shape}"
+        return ""
+
 
 def read_result(path: str) -> SavedResult:
     """Read a result, or a truth.
@@ -146,10 +167,7 @@ def read_result(path: str) -> SavedResult:
     found = {name: part.values for name, part in parts.items()}
     cubes = {name: found[name] for name in CUBES} if {*CUBES} <= {*found} else {}
     doubtful = found["DOUBTFUL"] != 0 if "DOUBTFUL" in found else None
-    oversample = number(path, header, "OVERSAMP") or 1.0
     labels = found["EPOCHS"]["label"].tolist() if "EPOCHS" in found else []
-    if fault := _fault(extended, tables, cubes, doubtful, oversample, len(labels)):
-        raise no_result(path, fault)
     cards = readable(parts["RESIDUALS"].header) if cubes else fits.Header()
     p = len(cubes["MODELS"]) if cubes else 0
     offsets = [
@@ -158,7 +176,7 @@ def read_result(path: str) -> SavedResult:
     names = [f"R{a}{b}_{j}" for j in range(1, p + 1) for a in (1, 2) for b in (1, 2)]
     turns = [number(path, cards, name) for name in names]
     is_turned = p > 0 and None not in turns
-    return SavedResult(
+    result = SavedResult(
         path,
         header,
         extended,
@@ -170,35 +188,11 @@ def read_result(path: str) -> SavedResult:
         found["MESSAGES"]["message"].tolist() if "MESSAGES" in found else [],
         labels,
     )
+    if fault := result._fault():
+        raise no_result(path, fault)
+    return result
 
 
 def _unquoted(quoted: re.Match[str]) -> str:
     raw = quoted[1].encode("ascii").decode("unicode_escape").encode("latin-1")
     return shlex.quote(os.fsdecode(raw))
-
-
-def _fault(
-    extended: NDArray[np.float64],
-    tables: dict[str, Columns],
-    cubes: dict[str, NDArray[np.float64]],
-    doubtful: NDArray[np.bool_] | None,
-    oversample: float,
-    n_labels: int,
-) -> str:
-    """Return why these are not the parts of a result; nothing where they are."""
-    if "STARS" not in tables:
-        return "there is no table STARS"
-    n_epochs = int(np.max(tables["STARS"].get("epoch", 0.0), initial=0.0)) + 1
-    if n_labels != n_epochs and (n_labels or n_epochs > 1):
-        return f"EPOCHS has {n_labels} labels of {n_epochs} epochs"
-    if extended.ndim != 2:
-        return "the image is a cube"
-    if oversample not in OVERSAMPLES or any(n % oversample for n in extended.shape):
-        return f"OVERSAMP is {oversample:g}"
-    for name, cube in cubes.items():
-        shape = len(cubes["MODELS"]), *(int(n // oversample) for n in extended.shape)
-        if cube.shape != shape and (name, cube.shape) != ("ELECTRONS", (*shape[:1], 1, 1)):
-            return f"{name} has the shape {cube.shape}"
-    if doubtful is not None and doubtful.shape != extended.shape:
-        return f"DOUBTFUL has the shape {doubtful.shape}"
-    return ""

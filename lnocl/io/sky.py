@@ -15,14 +15,17 @@ from astropy.wcs.utils import pixel_to_pixel
 
 from lnocl.core.scene.arrays import Array
 from lnocl.errors import InputError
-from lnocl.io.headers import make_wcs, quiet_log
-from lnocl.process import ignored_warnings
+from lnocl.io.headers import make_wcs
+from lnocl.process import ignored_notes, ignored_warnings
 
 # Largest variation of the offset between two images over them, in pixels, from rotation, scale and
 # distortion.
 MAX_OFFSET_VARIATION = 0.1
 # Points across an image at which the offset is computed.
 POINTS = 5
+
+# The coordinates of an image, its file and its shape.
+Image = tuple[WCS, str, tuple[int, int]]
 
 
 def celestial_wcs(header: fits.Header, path: str, advice: str = "give positions in pixels") -> WCS:
@@ -45,7 +48,7 @@ def has_celestial(header: fits.Header) -> bool:
 
 
 def _find_wcs(header: fits.Header) -> WCS | None:
-    with ignored_warnings(), quiet_log():  # of faults that astropy mends
+    with ignored_warnings(), ignored_notes("astropy"):  # of faults that astropy mends
         try:
             wcs = make_wcs(header)
             _ = wcs.pixel_to_world(0, 0).icrs  # those of the Sun are not on the sky
@@ -181,28 +184,16 @@ def transforms(
         An image without sky coordinates; one that shows another part of the sky than that one;
         one that no rotation, scale and shift brings within a tenth of a pixel.
     """
-    all_wcs = [
-        celestial_wcs(header, path, "leave align out")
-        for header, path in zip(headers, paths, strict=True)
-    ]
-    found = [
-        np.eye(2, 3)
-        if j == of_sky
-        else _transform(all_wcs[of_sky], wcs, paths[of_sky], path, shapes[of_sky], shape)
-        for j, (wcs, path, shape) in enumerate(zip(all_wcs, paths, shapes, strict=True))
-    ]
+    all_wcs = [celestial_wcs(*each, "leave align out") for each in zip(headers, paths, strict=True)]
+    images = list(zip(all_wcs, paths, shapes, strict=True))
+    first = images[of_sky]
+    found = [np.eye(2, 3) if each is first else _transform(first, each) for each in images]
     return np.array(found)
 
 
-def _transform(
-    first: WCS,
-    wcs: WCS,
-    first_path: str,
-    path: str,
-    first_shape: tuple[int, int],
-    shape: tuple[int, int],
-) -> Array:
-    (ny, nx), size = first_shape, np.array(shape[::-1])
+def _transform(first_image: Image, image: Image) -> Array:
+    (first, first_path, (ny, nx)), (wcs, path, shape) = first_image, image
+    size = np.array(shape[::-1])
     x, y = np.meshgrid(np.linspace(0, nx - 1, POINTS), np.linspace(0, ny - 1, POINTS))
     moved = _pixel_to(pixel_to_pixel, first, wcs, x, y)
     # NaN is where a projection has no pixel.

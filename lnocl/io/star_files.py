@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 from codecs import BOM_UTF8
-from collections.abc import Sequence
+from collections.abc import Mapping
 from typing import IO
 
 import numpy as np
@@ -67,23 +67,23 @@ def read_stars(path: str, header: fits.Header, image: str) -> Array:
     of_sky, sky_columns = _coordinates(path, table)
     if of_sky is not None:
         of_sky = _moved(path, of_sky, table, _date(header, image))
+    places: dict[str, Array] = {}  # by the names of their columns
     if columns is not None:
-        found = star_tables.in_pixels(table, columns, path)
-        names: Sequence[str] = columns[:2]
-        if of_sky is not None and has_celestial(header):
-            _compare(path, found, names, of_sky, sky_columns, header, image)
-    elif of_sky is not None:
-        found = to_pixels(of_sky, celestial_wcs(header, image), image)
-        names = sky_columns
-    else:
+        places[" and ".join(columns[:2])] = star_tables.in_pixels(table, columns, path)
+    if of_sky is not None and (columns is None or has_celestial(header)):
+        by_sky = to_pixels(of_sky, celestial_wcs(header, image), image)
+        places[" and ".join(sky_columns)] = by_sky
+    if not places:
         raise InputError(
             f"{path} has neither columns x and y nor ra and dec; it has "
             f"{', '.join(table.colnames) or 'no columns'}: rename two of them"
         )
+    names, found = next(iter(places.items()))
+    _compare(path, places, image)
     if not len(found):
         raise InputError(f"{path} has no row; give one a star, or leave --stars out for none")
     origin = ", the first pixel 1" if columns is not None and columns.origin else ""
-    note("%s: %s, by %s%s", path, counted(len(found), "star"), " and ".join(names), origin)
+    note("%s: %s, by %s%s", path, counted(len(found), "star"), names, origin)
     return _within(path, found, header, image)
 
 
@@ -160,23 +160,16 @@ def _moved(path: str, of_sky: SkyCoord, table: Table, date: Time | None) -> SkyC
     return SkyCoord(now.ra, now.dec)
 
 
-def _compare(
-    path: str,
-    positions: Array,
-    names: Sequence[str],
-    of_sky: SkyCoord,
-    sky_names: Sequence[str],
-    header: fits.Header,
-    image: str,
-) -> None:
+def _compare(path: str, places: Mapping[str, Array], image: str) -> None:
     """Refuse positions that are another image's, by the coordinates beside them."""
-    by_sky = to_pixels(of_sky, celestial_wcs(header, image), image)
-    away = np.hypot(*(by_sky - positions).T)
+    away = np.hypot(*np.ptp([*places.values()], axis=0).T)
     for row in np.flatnonzero(away > SAME_PLACE)[:1]:
+        here, there = (
+            f"{found[row, 0]:.2f}, {found[row, 1]:.2f} by {by}" for by, found in places.items()
+        )
         raise InputError(
-            f"{path} has its star in row {row} at {positions[row][0]:.2f}, {positions[row][1]:.2f} "
-            f"by {' and '.join(names)}, which {image} has at {by_sky[row][0]:.2f}, "
-            f"{by_sky[row][1]:.2f} by {' and '.join(sky_names)}: delete the columns that are wrong"
+            f"{path} has its star in row {row} at {here}, which {image} has at {there}: delete the "
+            "columns that are wrong"
         )
 
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from numpy.typing import NDArray
 
-from lnocl.errors import LnoclError
+from lnocl.errors import installed
 from lnocl.io.atomic import whole_file
 
 if TYPE_CHECKING:
@@ -37,12 +37,7 @@ def check_matplotlib() -> None:
     LnoclError
         Where matplotlib is missing.
     """
-    try:
-        import matplotlib  # noqa: F401
-    except ImportError:
-        raise LnoclError(
-            "pictures need matplotlib, which is not installed: pip install matplotlib"
-        ) from None
+    installed("matplotlib", "pictures need matplotlib, which is not installed")
 
 
 def save_figure(figure: Figure, path: str, overwrite: bool = False) -> None:

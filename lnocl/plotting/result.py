@@ -289,8 +289,6 @@ def outline(
 
 def finer_slices(there: Any, oversample: int) -> Any:
     """Return the rows and columns of a sky so many times as fine."""
-    if oversample == 1:
-        return there
     return tuple(
         slice(*(None if at is None else oversample * at for at in (part.start, part.stop)))
         for part in there

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from lnocl.core.scene.arrays import numbers, whole
+from lnocl.core.scene.arrays import numbers
 from lnocl.core.scene.quantities import in_unit
 from lnocl.errors import InputError
 
@@ -30,11 +30,6 @@ def saturation_level(saturation: float | None) -> float:
     if level <= 0:
         raise InputError(f"`saturation` must be positive; {level:g} was given")
     return level
-
-
-def whole_size(size: int | None) -> int | None:
-    """Return the side of the PSF, pixels; None where the largest is to be taken."""
-    return None if size is None else whole("size", size, MIN_SIZE)
 
 
 def wrapped_angles(rotate: Sequence[float]) -> list[float]:

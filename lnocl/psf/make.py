@@ -12,7 +12,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from lnocl.core.scene.arrays import Array, Mask, flag
+from lnocl.core.scene.arrays import Array, Mask, flag, whole
 from lnocl.core.scene.psfs import PSF_ERROR
 from lnocl.core.scene.quantities import in_unit, split
 from lnocl.core.scene.shifting import MARGIN
@@ -353,7 +353,8 @@ def make_psfs(
     if not isinstance(background, str):
         background = in_unit("background", background, unit or "")
     given, bad = read_image("frame", frame, mask)
-    side, angles = checks.whole_size(size), checks.wrapped_angles(rotate)
+    side = None if size is None else whole("size", size, checks.MIN_SIZE)
+    angles = checks.wrapped_angles(rotate)
     recentre, clip_negative = flag("recentre", recentre), flag("clip_negative", clip_negative)
     # A repaired pixel takes nothing from its value, however far beyond the level that is.
     pixels = np.where(bad, 0.0, np.minimum(given, checks.saturation_level(saturation)))

@@ -76,8 +76,6 @@ def reach(side: int, angle: float) -> int:
     int
         Pixels from the middle, along x or y.
     """
-    if angle == 0:
-        return side // 2
     t = math.radians(abs(_quarters(angle)[1]))
     return math.ceil(side // 2 * (math.cos(t) + math.sin(t)) - 1e-9)
 

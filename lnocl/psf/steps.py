@@ -219,7 +219,7 @@ def find_centres(
         return centres, None, lines, width
     pixel = nearest_pixel(centres[0])
     shift = pixel[0] - centres[0][0], pixel[1] - centres[0][1]
-    moved = f"; shifted by x {_plain(shift[1], 3)}, y {_plain(shift[0], 3)}"
+    moved = f"; shifted by x {shift[1]:z.3f}, y {shift[0]:z.3f}"
     return centres, shift, [lines[0] + moved], width
 
 
@@ -424,10 +424,5 @@ def _at(pixel: Pixel) -> str:
     return f"x = {pixel[1]}, y = {pixel[0]}"
 
 
-def _plain(value: float, digits: int) -> str:
-    """Return a number without a minus sign before zero."""
-    return f"{round(value, digits) + 0.0:.{digits}f}"
-
-
 def _percent(share: float, digits: int = 2) -> str:
-    return _plain(100 * float(share), digits) + " %"
+    return f"{100 * float(share):z.{digits}f} %"

@@ -552,9 +552,7 @@ class Result(Measured):
 def make_result(outcome: Outcome) -> Result:
     """Return the result of a reconstruction that has ended."""
     scene = outcome.scene
-    history = np.zeros(len(outcome.objectives), HISTORY_DTYPE)
-    history["iteration"] = np.arange(len(history))
-    history["objective"] = outcome.objectives
+    history = np.array(list(enumerate(outcome.objectives)), HISTORY_DTYPE)
     return Result(
         extended=outcome.estimate.observed_sky,
         star_fluxes=outcome.fluxes_of_stars,

@@ -5,25 +5,21 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 from importlib.metadata import version
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from astropy.io import fits
 
 from lnocl.core.runs.outcome import Outcome, PsfRefinement
+from lnocl.core.scene.observation import Observation
 from lnocl.errors import note
 from lnocl.io import sky
 from lnocl.io.fitsread import wcs_cards
 from lnocl.io.fitswrite import Card, column_unit, write_result
 from lnocl.io.parts import PARTS, Column
+from lnocl.result import Result
 from lnocl.result.kept import to_parts
 from lnocl.result.views import electrons_in
-
-if TYPE_CHECKING:
-    from astropy.io import fits
-
-    from lnocl.core.scene.observation import Observation
-    from lnocl.result import Result
-
 
 # The table ESTIMATE has this many bytes at most.
 MOST_BYTES = 2**26
@@ -172,11 +168,8 @@ def _star_columns(
     """Return the columns of the table of stars after positions and fluxes."""
     columns, positions = [], result.star_positions
     if np.isfinite(result.star_position_errors).any():
-        x_error, y_error = result.star_position_errors.T
-        columns += [
-            Column("x_error", x_error, "pix", "standard error"),
-            Column("y_error", y_error, "pix", "standard error"),
-        ]
+        for axis, each in zip("xy", result.star_position_errors.T, strict=True):
+            columns.append(Column(f"{axis}_error", each, "pix", "standard error"))
     flux_errors = result.star_flux_errors / electrons
     columns.append(Column("flux_error", flux_errors, column_unit(unit), "standard error"))
     if (n_epochs := result._observation.n_epochs) > 1:

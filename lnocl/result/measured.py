@@ -10,17 +10,17 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 
 from lnocl.core.runs.outcome import Outcome, StarErrors
+from lnocl.core.runs.start import Setup
 from lnocl.core.scene.arrays import Array
 from lnocl.core.scene.observation import Observation
 from lnocl.errors import InputError
+from lnocl.parallel import Parallel, check_parallel
 from lnocl.residuals import StarResiduals
 
 if TYPE_CHECKING:
     from astropy.io import fits
 
     from lnocl.core.runs.bootstrap import Bootstrap
-    from lnocl.core.runs.start import Setup
-    from lnocl.parallel import Parallel
     from lnocl.significance import Significance
 
 
@@ -349,7 +349,6 @@ class Measured:
         """
         from lnocl.core.runs.bootstrap import bootstrap, check_number
         from lnocl.io.regions import read_parts
-        from lnocl.parallel import check_parallel
 
         check_number(n, seed)
         check_parallel(parallel)

@@ -14,7 +14,7 @@ from lnocl.core.scene.counts import means
 from lnocl.core.scene.stars import MAX_SHIFT
 from lnocl.errors import counted
 from lnocl.residuals import SIGNIFICANCE, Fit, sharp_sources
-from lnocl.result.verdict import in_words
+from lnocl.result.verdict import faults, in_words, is_doubt
 
 if TYPE_CHECKING:
     from lnocl.core.scene.observation import Observation
@@ -181,8 +181,6 @@ def _light_curves(result: Result, unit: Unit) -> list[str]:
 
 def _trust(result: Result, unit: Unit, is_warned: bool) -> Iterator[str]:
     """Yield whether to trust a result and why not; then what its extended source may hold."""
-    from lnocl.result.verdict import faults, is_doubt
-
     first, *others = found = faults(result) or [""]
     if first:
         yield f"{'perhaps' if all(map(is_doubt, found)) else 'no'}: {first}"

@@ -90,13 +90,8 @@ class Experiment:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        for name, unit in (
-            ("wavelength", u.um),
-            ("bandwidth", u.um),
-            ("pixel_scale", u.mas),
-            ("exposure_time", u.min),
-            ("zero_point", u.Jy),
-        ):
+        for name in ("wavelength", "bandwidth", "pixel_scale", "exposure_time", "zero_point"):
+            unit = getattr(Experiment, name).unit  # that of the default
             object.__setattr__(self, name, positive(name, getattr(self, name), unit) * unit)
         for name, unit in (("extended_magnitude", u.mag), ("sky_brightness", MAG_PER_ARCSEC2)):
             object.__setattr__(self, name, number(name, getattr(self, name), unit) * unit)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import time
-import warnings
 from collections.abc import Collection, Iterator, Sequence
 from typing import Any, NamedTuple
 
@@ -15,6 +14,7 @@ from lnocl.core.scene.arrays import Array, whole
 from lnocl.core.scene.observation import Observation
 from lnocl.deconvolution import deconvolve
 from lnocl.errors import InputError, LnoclWarning, MisfitWarning
+from lnocl.process import ignored_warnings
 from lnocl.result import Estimate, Result
 from lnocl.simulation import hh34, simulate
 
@@ -168,18 +168,15 @@ def compare(
         given = PAPER | setting | {"n_iter": n_iter, "device": device} | more
         return deconvolve(case.observation, case.stars, **given)
 
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", MisfitWarning)  # as after an iteration is no wonder
+    with ignored_warnings(MisfitWarning):  # as after an iteration is no wonder
         reconstruct(settings[0], 1)  # whose other warnings are shown
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", LnoclWarning)
+    with ignored_warnings(LnoclWarning):
         for setting in settings:  # compiled, and with their errors raised, before the work
             reconstruct(setting, 1)
     reference = None
     for setting in settings:
         timer = IterationTimer({n_iter // part for part in PARTS})
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", LnoclWarning)
+        with ignored_warnings(LnoclWarning):
             result = reconstruct(setting, n_iter, callback=timer, progress=progress)
         reference = result.extended if reference is None else reference
         if not reference[case.rows].any():

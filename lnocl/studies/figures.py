@@ -14,14 +14,13 @@ from lnocl.io import atomic
 from lnocl.io.parts import read_parts
 from lnocl.io.saved_results import SavedResult, read_result
 from lnocl.plotting.beside import draw_beside
-from lnocl.plotting.figure import check_matplotlib, save_figure
+from lnocl.plotting.figure import Figure, check_matplotlib, save_figure
 from lnocl.plotting.light_curves import light_curves
 from lnocl.plotting.profiles import draw_bands
 from lnocl.plotting.result import ResultView, draw_result
 
 if TYPE_CHECKING:
     from astropy.table import Table
-    from matplotlib.figure import Figure
 
 # What is larger is no number of a result, and differences of such are not finite.
 LARGEST = 1e300

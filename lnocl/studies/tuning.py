@@ -18,10 +18,7 @@ from lnocl.errors import DeviceError
 SIZE, N_IMAGES, TURNS, SECONDS_A_TURN = 1024, 4, 7, 0.1
 MOST_A_TURN = 1000
 MOST = (TURNS + 2) * MOST_A_TURN
-PRECISIONS: dict[str, np.dtype[Any]] = {
-    "single": np.dtype(np.float32),
-    "double": np.dtype(np.float64),
-}
+PRECISIONS: dict[str, np.dtype[Any]] = {"single": np.dtype("f4"), "double": np.dtype("f8")}
 # A tuning is taken in the place of the safe one if it takes less than this share of its time.
 WORTH = 0.97
 
