@@ -85,7 +85,7 @@ def mask_star(image: ArrayLike, star: tuple[int, int]) -> Array:
     >>> mask_star(np.ones((4, 4)), (1, 2)).sum()
     np.float64(7.0)
     """
-    masked = _finite_plane("image", bare("image", image)).copy()
+    masked = _plane("image", bare("image", image)).copy()
     masked[_box(star, masked.shape)] = 0.0
     return masked
 
@@ -139,8 +139,8 @@ def restoration_error(
     0.2
     """
     reconstruction, unit = split("reconstruction", reconstruction)
-    found = _finite_plane("reconstruction", reconstruction)
-    true = _finite_plane("truth", in_unit("truth", truth, unit or ""))
+    found = _plane("reconstruction", reconstruction)
+    true = _plane("truth", in_unit("truth", truth, unit or ""))
     if found.shape != true.shape:
         raise InputError(f"the reconstruction has shape {found.shape} and the truth {true.shape}")
     if star is not None:
@@ -223,34 +223,22 @@ def flux_profile(image: ArrayLike, star: tuple[int, int] | None = None) -> Array
     >>> flux_profile([[1, 2, 3], [0, 4, 0]])
     array([6., 4.])
     """
-    rows = _finite_plane("image", bare("image", image))
-    profile = rows.sum(axis=1)
+    plane = _plane("image", bare("image", image))
+    profile = plane.sum(axis=1)
     if star is not None:
-        profile[_box(star, rows.shape)[0]] = np.nan
+        profile[_box(star, plane.shape)[0]] = np.nan
     return profile
 
 
-def plane(name: str, values: ArrayLike) -> Array:
-    """Return real numbers of two dimensions, none of them masked, as float64.
-
-    Raises
-    ------
-    InputError
-        Other values.
-    """
+def _plane(name: str, values: ArrayLike) -> Array:
     array = unmasked(name, values)
     if array.ndim != 2 or array.dtype.kind not in "biuf":
         raise InputError(
             f"{name} has {array.ndim} dimensions of {array.dtype}; give two, of real numbers"
         )
-    return array.astype(np.float64, copy=False)
-
-
-def _finite_plane(name: str, values: ArrayLike) -> Array:
-    array = plane(name, values)
     if not np.isfinite(array).all():
         raise InputError(f"{name} holds values that are not finite")
-    return array
+    return array.astype(np.float64, copy=False)
 
 
 def _check_star(star: tuple[int, int], shape: tuple[int, ...]) -> tuple[int, int]:

@@ -12,10 +12,10 @@ from astropy import units as u
 from numpy.typing import ArrayLike
 from scipy.special import expit
 
+from lnocl.core.scene.arrays import unmasked
 from lnocl.core.scene.quantities import bare
 from lnocl.errors import InputError
 from lnocl.io import fitsread
-from lnocl.metrics import plane
 from lnocl.simulation.checks import check_shape, number
 
 # Below this the 24 rows around the star of `hh34` do not fit.
@@ -84,8 +84,14 @@ class Target:
     """
 
     def __init__(self, extended: ArrayLike, stars: Sequence[Star] = ()) -> None:
-        array = plane("the extended source", bare("the extended source", extended))
+        array = unmasked("the extended source", bare("the extended source", extended))
+        if array.ndim != 2 or array.dtype.kind not in "biuf":
+            raise InputError(
+                f"the extended source has {array.ndim} dimensions of {array.dtype}; "
+                "give two, of real numbers"
+            )
         check_shape(array.shape)
+        array = array.astype(np.float64)
         if not (np.isfinite(array).all() and (array >= 0).all()):
             raise InputError("the extended source must be finite and not negative everywhere")
         with np.errstate(over="ignore"):
