@@ -23,6 +23,8 @@ FITS = "the model fits"
 ELSEWHERE = 10
 # Electrons, or per second, that iterations which multiply leave of a star without light.
 NO_LIGHT = 1e-6
+# Where less than this share of the stars does not fit, that is not by the PSF.
+FEW = 0.4
 # Of a star that was moved by this share of `MAX_SHIFT` more may be needed.
 AT_LIMIT = 0.99
 
@@ -91,6 +93,8 @@ def faults(result: Result) -> list[str]:
         remedy = name_faults(findings.observation, seen) or "give a better PSF" + (
             ", or try `refine_psfs` jitter pixels" if findings.may_free_pixels else ""
         )
+        if len(unfitted) < FEW * len(places):
+            remedy = "the PSF fits the others: see whether a cosmic ray or another star lies there"
         lines.append(
             f"the model does not fit at {len(unfitted)} of "
             f"{counted(len(at_stars) // n_epochs, 'star')}, {unfitted.words(' ')}: {remedy}"

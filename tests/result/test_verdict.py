@@ -131,6 +131,25 @@ def test_a_star_counts_once_and_its_epochs_are_named(nameless):
     assert "(10, 13) in epoch May, 18 %; (20, 9) in 2 epochs, 17 to 18 %" in paired
 
 
+@pytest.mark.parametrize(("n_bad", "remedy"), [(1, "the PSF fits the others: see"), (2, "give a")])
+def test_one_misfit_of_several_stars_is_not_blamed_on_the_psf(nameless, n_bad, remedy):
+    bad = StarResiduals(Fit(100, 900.0, 200.0), Fit(), 0.0, 0.0)
+    found = [bad] * n_bad + [StarResiduals(Fit(100, 100.0, 200.0), Fit(), 0.0, 0.0)] * (4 - n_bad)
+    places = np.array([(10.0, 13.0), (20.0, 9.0), (5.0, 25.0), (14.0, 20.0)])
+    findings = SimpleNamespace(
+        given_positions=places,
+        may_free_pixels=False,
+        observation=SimpleNamespace(n_epochs=1, epoch_labels=("0",), star_places=()),
+    )
+    result = SimpleNamespace(
+        star_positions=places, star_fluxes=np.full(4, 5.0), psf_refinement=None, smoothing=0.0,
+        star_residuals=lambda: found, fit=Fit, _findings=findings,
+    )  # fmt: skip
+    (line,) = faults(result)
+    assert line.startswith(f"the model does not fit at {n_bad} of 4 stars, ")
+    assert f": {remedy}" in line
+
+
 @pytest.mark.parametrize("more", [[], ["--quiet"]])
 def test_the_shell_says_each_fault_once(more, tmp_path, monkeypatch, capsys):
     from astropy.io import fits
