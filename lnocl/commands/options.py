@@ -9,6 +9,8 @@ from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from lnocl.errors import InputError, note
 from lnocl.io.names import ERR, parse_kind
 from lnocl.parallel import CURRENT
@@ -278,13 +280,13 @@ def star_places(
     if table:
         from lnocl.io.star_files import read_stars
 
-        given = places.copy()
-        for x, y in read_stars(table, header, image).tolist():
-            again = any(math.dist((x, y), place) < SAME_STAR for place in given)
-            if again:
+        found = read_stars(table, header, image).tolist()
+        for place in places:
+            away = [math.dist(place, star) for star in found]
+            if min(away, default=math.inf) < SAME_STAR:
+                x, y = found.pop(int(np.argmin(away)))
                 note("%s: its star at (%.7g, %.7g) is one of `stars`, and taken once", table, x, y)
-            else:
-                places.append((x, y))
+        places += found
     return [(x, y) for x, y in places]
 
 

@@ -63,7 +63,7 @@ SCENES = {
         PLAIN | {PLACES, EXPOSURES},
         "no halos",
     ),
-    "epochs": (lambda: observe(2, epochs=[0, 1]), STAR, {}, PLAIN | {PLACES}, "no halos"),
+    "epochs": (lambda: observe(2, epochs=[0, 1]), STAR, {}, PLAIN, "no halos"),
     "a halo": (lambda: observe(halos=[HALO]), STAR, {}, PLAIN | {HALOS}, "have no error"),
     "a field": (lambda: observe(psfs=FIELD), STAR, {}, PLAIN, "no halos"),
     "levels": (lambda: observe(background_error=1.0), STAR, {}, PLAIN | {LEVELS}, "no halos"),

@@ -52,6 +52,29 @@ def test_stars_in_noise_move_no_image():
     assert not displacements(observe((0.0, 0.0)), np.array([[20.0, 15.0]])).any()
 
 
+@pytest.mark.parametrize("widths", [(1.2, 2.5), (2.5, 1.2)])
+@pytest.mark.parametrize(("flux", "width", "away"), [(1e5, 1.5, 6), (3e5, 0.7, 10), (1e5, 3.0, 4)])
+def test_brighter_light_beside_a_star_moves_no_image(widths, flux, width, away):
+    """Which a wide PSF blends with the star, or makes higher than it."""
+    rng, images, psfs = np.random.default_rng(3), [], []
+    light = np.zeros((N, N))
+    light[round(STARS[0][1]), round(STARS[0][0]) + away] = flux
+    for sigma in widths:
+        psf = np.exp(-(X**2 + Y**2) / 2 / sigma**2)
+        psfs.append(psf / psf.sum())
+        star = 5e4 * place(psfs[-1], (N, N), *STARS[0]).on_grid((N, N))
+        images.append(rng.poisson(30 + star + gaussian_filter(light, np.hypot(sigma, width))))
+    observation = lnocl.Observation(images, psfs, background=30.0)
+    assert not displacements(observation, STARS[:1]).any()
+
+
+def test_the_image_whose_pixels_the_sky_has_stays():
+    images = observe((0.0, 0.0)).images[::-1]
+    maps = [np.array([[1.0, 0.0, 5.0], [0.0, 1.0, 0.0]]), np.eye(2, 3)]
+    observation = lnocl.Observation(images, PSFS[::-1], background=60.0, transforms=maps)
+    np.testing.assert_allclose(displacements(observation, STARS), [(-5, 0), (0, 0)], atol=0.15)
+
+
 def test_turned_images_are_moved_in_their_own_pixels():
     maps = rotations([0.0, 35.0], MIDDLE)
     found = displacements(observe((5.2, -7.7), maps), STARS + np.array([0.6, -0.5]))

@@ -81,7 +81,7 @@ WHOLE = Condition(lambda plan: not plan.in_tiles, "the images are divided into t
 
 # What each step needs, in the order in which reasons are given.
 NEEDS: dict[str, tuple[Condition, ...]] = {
-    PLACES: (AUTO, MENDS, HAS_STARS, SEVERAL, SHOWS_PSFS, NO_HALOS),
+    PLACES: (AUTO, MENDS, HAS_STARS, SEVERAL, SHOWS_PSFS, STEADY_STARS, NO_HALOS, WHOLE),
     CORES: (AUTO, MENDS, HAS_STARS),
     RAYS: (AUTO, MENDS),
     EXPOSURES: (AUTO, MENDS, HAS_STARS, SEVERAL, STEADY_STARS, NO_HALOS),
@@ -141,7 +141,7 @@ class Plan:
     >>> image[5, 8] += 100.0
     >>> obs = lnocl.Observation(np.stack([image] * 2), np.ones((3, 3)), epochs=[0, 1])
     >>> print(lnocl.plan(obs, [(8, 5)]))
-    align images by their stars: yes
+    align images by their stars: no, fewer than three stars may vary from epoch to epoch
     mask saturated cores: yes
     mask cosmic rays: yes
     fit exposures to stars: no, fewer than three stars may vary from epoch to epoch

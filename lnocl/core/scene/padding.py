@@ -22,12 +22,12 @@ MIN_EXCESS = 5.0
 
 
 def choose_pad(observation: Observation) -> int:
-    """Return the pad "auto": `recommend_pad` where light runs over an edge, else the offsets."""
-    if runs_over_the_edge(observation):
-        return recommend_pad(observation)
-    if observation.is_turned:  # the grid holds all that is turned
-        return 0
-    return int(np.ceil(abs(observation.offsets).max()))
+    """Return the pad "auto": the offsets, or `recommend_pad` where light runs over an edge.
+
+    The grid of turned images holds all that is turned.
+    """
+    shifted = 0 if observation.is_turned else int(np.ceil(abs(observation.offsets).max()))
+    return max(shifted, recommend_pad(observation) if runs_over_the_edge(observation) else 0)
 
 
 def recommend_pad(observation: Observation) -> int:

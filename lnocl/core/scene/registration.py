@@ -9,12 +9,18 @@ w being 0 at bad pixels. A misplaced image has all its stars moved alike, so tha
 at these are summed for each move. It is moved by the nearest maximum of the sum that is no side
 lobe of a brighter one. What the image that the sky's pixels are of needs too is no error of places
 of images, but of stars.
+
+Other sources may be brighter, or blend with the stars where PSFs are wide. So an image k, seen
+through the PSF of that image i too, has to be much more alike that image through its PSF, where it
+is moved, than where it is not: these are of one PSF,
+
+.. math:: (g_i - b_i) * P_k \approx s \, (g_k - b_k) * P_i.
 """
 
 from __future__ import annotations
 
 import numpy as np
-from scipy.ndimage import map_coordinates, maximum_filter
+from scipy.ndimage import affine_transform, map_coordinates, maximum_filter
 from scipy.signal import fftconvolve
 
 from lnocl.core.scene.arrays import Array
@@ -33,6 +39,8 @@ SIDE, BESIDE = 2 * REACH + 1, 3
 APART, SHARE, ALIKE, SIGNIFICANT = 1.5, 0.2, 0.6, 30.0
 # The same where stars are expected to so many pixels: others may be brighter in one image.
 LEAST_SHARE, NEAR = 0.05, 2.0
+# The square of what is left where an image is moved is this share of that where it is not.
+BETTER = 0.5
 # Stars are so many times as bright at places of other angles where these are the right ones.
 CLEARLY = 1.1
 
@@ -40,8 +48,8 @@ CLEARLY = 1.1
 def displacements(observation: Observation, stars: Array) -> Array:
     """Return how far each image lies from its place, pixels of its own, shape (p, 2).
 
-    That is 0 for the first image, for those that lie within `LEAST` of their places, and for those
-    whose stars do not tell.
+    That is 0 for the image whose pixels the sky has, for those that lie within `LEAST` of their
+    places, and for those whose stars do not tell.
 
     Parameters
     ----------
@@ -51,14 +59,69 @@ def displacements(observation: Observation, stars: Array) -> Array:
         Places of stars on the sky, pixels.
     """
     psfs, moved = _middles(observation), np.zeros((observation.n_images, 2))
-    stars = _brightest(observation, stars)
-    first, share = _found(observation, 0, stars, psfs[0], moved[0], SHARE / ALIKE)
-    of_stars = np.linalg.solve(observation.turns[0], first)
-    for j in range(1, len(psfs) if np.isfinite(of_stars).all() else 0):
-        expected = observation.turns[j] @ of_stars
-        moved[j] = _found(observation, j, stars, psfs[j], expected, share)[0] - expected
-    moved[~(np.hypot(*moved.T) > LEAST)] = 0.0
+    i, stars = _first(observation), _brightest(observation, stars)
+    found, share = _found(observation, i, stars, psfs[i], moved[i], SHARE / ALIKE)
+    of_stars = np.linalg.solve(observation.turns[i], found)
+    if not np.isfinite(of_stars).all():
+        return moved
+    for k in range(len(psfs)):
+        expected = observation.turns[k] @ of_stars
+        by = _found(observation, k, stars, psfs[k], expected, share)[0] - expected
+        if np.hypot(*by) > LEAST and _is_better(observation, (i, k), stars + of_stars, psfs, by):
+            moved[k] = by
     return moved
+
+
+def _first(observation: Observation) -> int:
+    """Return the image whose pixels the sky has."""
+    is_own = (observation.turns == np.eye(2)).all(axis=(1, 2)) & ~observation.offsets.any(axis=1)
+    return int(np.argmax(is_own))
+
+
+def _is_better(
+    observation: Observation, pair: tuple[int, int], stars: Array, psfs: list[Array], by: Array
+) -> bool:
+    """Return whether image k, moved, is much more alike image i, each through the other's PSF."""
+    i, k = pair
+    turn = observation.turns[k] @ np.linalg.inv(observation.turns[i])  # from image i to image k
+    seen = [
+        fftconvolve(_light(observation, a), _turned(psfs[b], m), "same")
+        for a, b, m in ((i, k, turn), (k, i, np.linalg.inv(turn)))
+    ]
+    y, x = np.indices((SIDE, SIDE)) - REACH
+    left = []
+    for move in (np.zeros(2), by):
+        pairs = []
+        for star in stars:
+            rows_columns = [y, x] + observation.places(i, star)[::-1, None, None]
+            offsets = np.einsum("ab,byx->ayx", turn, np.stack([x, y]))
+            there = offsets + (observation.places(k, star) + move)[:, None, None]
+            pairs.append(
+                [
+                    map_coordinates(seen[0], rows_columns, order=1),
+                    map_coordinates(seen[1], there[::-1], order=1),
+                ]
+            )
+        one, other = np.array(pairs).transpose(1, 0, 2, 3)
+        scale = (one * other).sum() / max((other**2).sum(), 1e-300)
+        left.append(((one - scale * other) ** 2).sum())
+    return bool(left[1] < BETTER * left[0])
+
+
+def _turned(psf: Array, turn: Array) -> Array:
+    """Return a PSF at pixels ``turn @ u`` from its middle, of unit sum."""
+    u = np.flip(turn)  # in the order of rows and columns
+    middle = np.array(psf.shape) // 2
+    turned = (
+        affine_transform(psf, u, middle - u @ middle, order=3) if (turn != np.eye(2)).any() else psf
+    )
+    return np.asarray(turned / turned.sum())
+
+
+def _light(observation: Observation, j: int) -> Array:
+    """Return an image above its background, 0 where it is bad."""
+    light = observation.images[j] - observation.background[j]
+    return np.where(observation.mask[j], 0.0, light)
 
 
 def _found(
@@ -130,9 +193,10 @@ def _middles(observation: Observation) -> list[Array]:
 
 
 def _brightest(observation: Observation, stars: Array) -> Array:
-    """Return the stars of which the first image has most light, `MOST_STARS` of them."""
-    columns, rows = np.round(observation.places(0, stars)).astype(int).T
-    image = observation.images[0]
+    """Return the stars of which that image has most light, `MOST_STARS` of them."""
+    i = _first(observation)
+    columns, rows = np.round(observation.places(i, stars)).astype(int).T
+    image = observation.images[i]
     inside = (rows >= 0) & (rows < image.shape[0]) & (columns >= 0) & (columns < image.shape[1])
     light = np.where(inside, image[rows * inside, columns * inside], 0.0)
     return stars[np.argsort(-light, kind="stable")[:MOST_STARS]]
