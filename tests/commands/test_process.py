@@ -125,7 +125,11 @@ class TestProcess:
         (process.stdout if command == ["selftest"] else process.stderr).readline()
         assert len(list(kernels.glob("lnocl-kernels-*"))) == 1
         process.send_signal(signal.SIGTERM)
-        _, complaint = process.communicate()
+        try:
+            _, complaint = process.communicate(timeout=10)
+        except subprocess.TimeoutExpired:  # it was lost, once in ten runs on a busy machine
+            process.send_signal(signal.SIGTERM)
+            _, complaint = process.communicate()
         assert (process.returncode, without_progress(complaint)) == (
             143,
             "lnocl: error: terminated\n",
