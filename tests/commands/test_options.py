@@ -12,7 +12,7 @@ import pytest
 from astropy.io import fits
 from commandline import NUMPY, one_complaint, run
 
-from lnocl.commands import cli, deconvolve, messages, psf, record
+from lnocl.commands import cli, deconvolve, messages, options, psf, record
 from lnocl.commands.declared import parameter
 from lnocl.commands.options import EITHER, option, position
 from lnocl.io.calibration import Calibration
@@ -335,3 +335,12 @@ def test_every_option_has_a_help_of_ascii_words_that_names_flags(name, capsys):
     assert shown.isascii()
     assert "`" not in shown
     assert all(each.keywords["help"] for g in cli.COMMANDS[name].options.values() for each in g)
+
+
+def test_a_star_of_a_table_that_is_given_too_is_taken_once():
+    Path("stars.csv").write_text("x,y\n5.8,9.3\n6.9,9.1\n20,3\n")
+    header = fits.Header({"NAXIS1": 40, "NAXIS2": 40})
+    found = options.star_places([(6.0, 9.0)], "stars.csv", header, "image.fits")
+    assert found == [(6.0, 9.0), (6.9, 9.1), (20.0, 3.0)]
+    apart = options.star_places([(6.0, 12.0)], "stars.csv", header, "image.fits")
+    assert len(apart) == 4

@@ -304,3 +304,8 @@ def test_replicas_name_star_and_epoch():
 def test_epochs_of_the_wrong_shape_are_refused():
     with pytest.raises(lnocl.LnoclError, match=r"epochs`? has shape"):
         observation(epochs=[1, 2])
+
+
+def test_labels_that_are_whole_numbers_have_no_decimals():
+    given = observation().replace(epochs=[303.0, 60735.25, 303.0])
+    assert given.epoch_labels == ("303", "60735.25")

@@ -174,6 +174,13 @@ def test_light_curves_are_below(labels, places, shown):
     assert light_curves(np.ones(2), np.ones(2), ["0"], "") is None
 
 
+def test_of_many_labels_of_epochs_some_are_on_the_axis():
+    labels = [f"n{k:02d}" for k in range(11)]
+    curves = light_curves(np.ones(11), np.full(11, 0.1), labels, "electron")
+    axis = draw_result(make_view(p=1, light_curves=curves)).subfigs[-1].axes[0]
+    assert [text.get_text() for text in axis.get_xticklabels()] == labels[::2]
+
+
 @pytest.mark.exhaustive
 def test_stars_are_circled_in_image_and_source():
     figure = draw_result(make_view(p=1, offsets=np.array([[2.0, 0.0]])))

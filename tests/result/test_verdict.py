@@ -10,7 +10,7 @@ from scenes import make_psfs
 import lnocl
 from lnocl.commands import cli
 from lnocl.residuals import Fit, StarResiduals
-from lnocl.result.verdict import _elsewhere, faults
+from lnocl.result.verdict import _elsewhere, faults, is_doubt
 
 N, STAR, LEVEL = 48, (21, 26), 20.0
 Y, X = np.indices((N, N))
@@ -129,6 +129,7 @@ def test_a_star_counts_once_and_its_epochs_are_named(nameless):
         "2 stars may exchange light with the extended source there, up to this"
     )
     assert "(10, 13) in epoch May, 18 %; (20, 9) in 2 epochs, 17 to 18 %" in paired
+    assert [is_doubt(each) for each in (unfitted, lit, paired)] == [False, True, True]
 
 
 @pytest.mark.parametrize(("n_bad", "remedy"), [(1, "the PSF fits the others: see"), (2, "give a")])

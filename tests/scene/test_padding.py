@@ -97,3 +97,11 @@ def test_source_that_runs_over_the_edge_is_found_with_it():
         found = paper(observation, pad=pad, n_iter=30, engine="numpy").extended
         errors[pad] = np.sqrt(np.mean((found - sky)[10:-10, -10:] ** 2))
     assert errors["auto"] < errors[0] / 8  # measured a twentieth
+
+
+def test_where_light_runs_over_an_edge_it_is_no_less_than_the_offsets():
+    images = np.full((2, 64, 64), 90.0)
+    images[:, 0, 20:40] += 900.0
+    offsets = np.array([(0.0, 0.0), (19.4, -3.0)])
+    given = lnocl.Observation(images, GAUSSIAN, background=90.0, offsets=offsets)
+    assert choose_pad(given) == 20 > recommend_pad(given)

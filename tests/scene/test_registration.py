@@ -113,3 +113,17 @@ def test_the_file_of_a_result_has_where_its_images_were_moved(tmp_path):
     assert outcome.observation.offsets[1] == pytest.approx((4.2, -3.3), abs=0.1)
     for model, expected in zip(again.models(), outcome.models(), strict=True):
         np.testing.assert_array_equal(model, expected)
+
+
+def test_an_image_without_a_good_pixel_stays_without_a_warning():
+    observation = observe((9.0, 4.0))
+    mask = np.zeros(observation.images.shape, bool)
+    mask[1] = True
+    assert not displacements(observation.replace(mask=mask), STARS).any()
+
+
+def test_right_angles_are_not_doubted_for_brighter_stars_that_are_not_given():
+    maps = rotations([0.0, 40.0], MIDDLE)
+    stars = np.array([[31.3, 46.2], [44.6, 58.4], [52.8, 35.1]])
+    observation = observe((0.0, 0.0), maps, stars=stars[::-1])  # FLUXES: the last has most light
+    assert turned_otherwise(observation, stars[:2]) == []

@@ -14,6 +14,7 @@ from lnocl.core.scene.detector import psfs_on_detector
 from lnocl.core.scene.noise_check import measure_noise
 from lnocl.core.scene.observation import Observation
 from lnocl.core.scene.penalty import Penalty
+from lnocl.core.scene.star_psfs import owned
 from lnocl.errors import counted, note, warn
 from lnocl.process import ignored_notes, ignored_warnings
 
@@ -30,19 +31,21 @@ def align_images(setup: Setup) -> tuple[Setup, str]:
     """
     from lnocl.core.scene.registration import displacements, turned_otherwise
 
-    if others := [f"`images[{j}]`" for j in turned_otherwise(setup.observation, setup.stars)]:
+    observation = setup.observation
+    stars = setup.stars[owned(observation, setup.stars) < 0]
+    if others := [f"`images[{j}]`" for j in turned_otherwise(observation, stars)]:
         warn(
-            f"the stars of {_first(others)} lie as if it were turned by as much the other way: "
+            f"the stars of {_first(others)} lie as if turned by as much the other way: "
             "give its angle the other sign"
         )
         return setup, ""
-    moved = displacements(setup.observation, setup.stars)
+    moved = displacements(observation, stars)
     named = [f"`images[{j}]` by ({x:+.2f}, {y:+.2f})" for j, (x, y) in enumerate(moved) if x or y]
     if not named:
         return setup, ""
-    words = f"{_first(named)} pixels, by {counted(len(setup.stars), 'star')}"
+    words = f"{_first(named)} pixels, by {counted(len(stars), 'star')}"
     note(f"images moved: {words} (`mend_images` False leaves them)")
-    return replace(setup, observation=setup.observation.moved(moved)), words
+    return replace(setup, observation=observation.moved(moved)), words
 
 
 def mask_cores(setup: Setup) -> tuple[Setup, str]:

@@ -6,20 +6,23 @@ there would be over its noise, but for a factor,
 .. math:: C = \frac{P \star w (g - b)}{\sqrt{P^2 \star w}},
 
 w being 0 at bad pixels. A misplaced image has all its stars moved alike, so that the squares of C
-at these are summed for each move. It is moved by the nearest maximum of the sum that is no side
-lobe of a brighter one. What the image that the sky's pixels are of needs too is no error of places
-of images, but of stars.
+at these are summed for each move. The candidate is the nearest maximum of the sum that is no side
+lobe of a brighter one. What the image needs too whose pixels the sky has is an error of the places
+of stars, not of images.
 
-Other sources may be brighter, or blend with the stars where PSFs are wide. So an image k, seen
-through the PSF of that image i too, has to be much more alike that image through its PSF, where it
-is moved, than where it is not: these are of one PSF,
+Other sources may be brighter, or blend with the stars where PSFs are wide. So image k has to agree
+much better with that image i where it is moved. Each is seen through the PSF of the other, so that
+both have one PSF,
 
 .. math:: (g_i - b_i) * P_k \approx s \, (g_k - b_k) * P_i.
 """
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
+from numpy.typing import NDArray
 from scipy.ndimage import affine_transform, map_coordinates, maximum_filter
 from scipy.signal import fftconvolve
 
@@ -39,10 +42,8 @@ SIDE, BESIDE = 2 * REACH + 1, 3
 APART, SHARE, ALIKE, SIGNIFICANT = 1.5, 0.2, 0.6, 30.0
 # The same where stars are expected to so many pixels: others may be brighter in one image.
 LEAST_SHARE, NEAR = 0.05, 2.0
-# The square of what is left where an image is moved is this share of that where it is not.
-BETTER = 0.5
-# Stars are so many times as bright at places of other angles where these are the right ones.
-CLEARLY = 1.1
+# The squares by which an image differs from the first, moved or turned, over those as it is.
+BETTER, CLEARLY = 0.5, 0.25
 
 
 def displacements(observation: Observation, stars: Array) -> Array:
@@ -64,11 +65,17 @@ def displacements(observation: Observation, stars: Array) -> Array:
     of_stars = np.linalg.solve(observation.turns[i], found)
     if not np.isfinite(of_stars).all():
         return moved
-    for k in range(len(psfs)):
+    turns = observation.turns @ np.linalg.inv(observation.turns[i])
+    for k, turn in enumerate(turns):
         expected = observation.turns[k] @ of_stars
         by = _found(observation, k, stars, psfs[k], expected, share)[0] - expected
-        if np.hypot(*by) > LEAST and _is_better(observation, (i, k), stars + of_stars, psfs, by):
-            moved[k] = by
+        if np.hypot(*by) > LEAST:
+            at = observation.places(k, stars + of_stars)
+            stays, goes = (
+                _unlike(observation, i, k, stars + of_stars, psfs, lie, turn)
+                for lie in (at, at + by)
+            )
+            moved[k] = by if goes < BETTER * stays else 0.0
     return moved
 
 
@@ -78,37 +85,35 @@ def _first(observation: Observation) -> int:
     return int(np.argmax(is_own))
 
 
-def _is_better(
-    observation: Observation, pair: tuple[int, int], stars: Array, psfs: list[Array], by: Array
-) -> bool:
-    """Return whether image k, moved, is much more alike image i, each through the other's PSF."""
-    i, k = pair
-    turn = observation.turns[k] @ np.linalg.inv(observation.turns[i])  # from image i to image k
-    seen = [
-        fftconvolve(_light(observation, a), _turned(psfs[b], m), "same")
-        for a, b, m in ((i, k, turn), (k, i, np.linalg.inv(turn)))
-    ]
-    y, x = np.indices((SIDE, SIDE)) - REACH
-    left = []
-    for move in (np.zeros(2), by):
-        pairs = []
-        for star in stars:
-            rows_columns = [y, x] + observation.places(i, star)[::-1, None, None]
-            offsets = np.einsum("ab,byx->ayx", turn, np.stack([x, y]))
-            there = offsets + (observation.places(k, star) + move)[:, None, None]
-            pairs.append(
-                [
-                    map_coordinates(seen[0], rows_columns, order=1),
-                    map_coordinates(seen[1], there[::-1], order=1),
-                ]
-            )
-        one, other = np.array(pairs).transpose(1, 0, 2, 3)
-        scale = (one * other).sum() / max((other**2).sum(), 1e-300)
-        left.append(((one - scale * other) ** 2).sum())
-    return bool(left[1] < BETTER * left[0])
+def _unlike(
+    observation: Observation,
+    i: int,
+    k: int,
+    stars: Array,
+    psfs: list[Array],
+    lie: Array,
+    turn: Array,
+) -> float:
+    """Return the sum of squares by which images differ round stars, each through the other's PSF.
+
+    Image k has the stars where they `lie`, and is turned by `turn` against image i. A factor
+    between the images is free.
+    """
+    one = fftconvolve(_light(observation, i), _turned(psfs[k], turn), "same")
+    other = fftconvolve(_light(observation, k), _turned(psfs[i], np.linalg.inv(turn)), "same")
+    around = np.indices((SIDE, SIDE)).reshape(2, -1)[::-1] - REACH  # x and y
+    of_one, of_other = (
+        np.concatenate([map_coordinates(seen, (at[:, None] + by)[::-1], order=1) for at in places])
+        for seen, places, by in (
+            (one, observation.places(i, stars), around),
+            (other, lie, turn @ around),
+        )
+    )
+    scale = (of_one @ of_other) / max(float(of_other @ of_other), 1e-300)
+    return float(((of_one - scale * of_other) ** 2).sum())
 
 
-def _turned(psf: Array, turn: Array) -> Array:
+def _turned(psf: Array, turn: NDArray[Any]) -> Array:
     """Return a PSF at pixels ``turn @ u`` from its middle, of unit sum."""
     u = np.flip(turn)  # in the order of rows and columns
     middle = np.array(psf.shape) // 2
@@ -154,35 +159,43 @@ def _found(
 
 
 def turned_otherwise(observation: Observation, stars: Array) -> list[int]:
-    """Return images whose stars lie as if they were turned by as much the other way."""
-    found, stars = list[int](), _brightest(observation, stars)
-    for j, psf in enumerate(_middles(observation)):
-        places, turn = observation.places(j, stars), observation.turns[j]
-        if len(stars) > 1 and (turn != turn.T).any():
-            others = places.mean(axis=0) + (stars - stars.mean(axis=0)) @ turn
-            both = places, others
-            lies, would_lie = (_total(observation, j, psf, each).max() for each in both)
-            if would_lie > max(CLEARLY * lies, SIGNIFICANT):
-                found.append(j)
-    return found
+    """Return images that are much more alike the first if turned by as much the other way."""
+    psfs, others = _middles(observation), list[int]()
+    i, stars = _first(observation), _brightest(observation, stars)
+    for k, turn in enumerate(observation.turns @ np.linalg.inv(observation.turns[i])):
+        if len(stars) < 2 or (turn == turn.T).all():
+            continue
+        lie, middle = observation.places(k, stars), observation.places(k, stars.mean(axis=0))
+        rotation = turn / np.sqrt(abs(np.linalg.det(turn)))
+        would_lie = middle + (lie - middle) @ rotation @ rotation  # back, and as far again
+        is_, would_be = (
+            _unlike(observation, i, k, stars, psfs, at + _highest(observation, k, psfs[k], at), way)
+            for at, way in ((lie, turn), (would_lie, turn.T))
+        )
+        if would_be < CLEARLY * is_:
+            others.append(k)
+    return others
+
+
+def _highest(observation: Observation, k: int, psf: Array, places: Array) -> Array:
+    """Return the move for which stars at these places are most significant."""
+    total = _total(observation, k, psf, places)
+    return np.array(divmod(int(np.argmax(total)), SIDE)[::-1]) - REACH
 
 
 def _total(observation: Observation, j: int, psf: Array, places: Array) -> Array:
     """Return the root of the sum of squares of C over its noise, for each move of all places."""
-    image, mask = observation.images[j], observation.mask[j]
-    background = np.broadcast_to(observation.background[j], image.shape)
-    noise = np.sqrt(max(float(np.median(image[~mask])), 1.0))
+    image, mask, light = observation.images[j], observation.mask[j], _light(observation, j)
+    noise = np.sqrt(max(float(np.median(image[~mask])), 1.0)) if not mask.all() else 1.0
     half = 2 * REACH + BESIDE
     y, x = np.indices((SIDE, SIDE)) + BESIDE
     total, seen = np.zeros((SIDE, SIDE)), psf[::-1, ::-1]
     for at_x, at_y in places.tolist():
         row, column = round(at_y), round(at_x)
         rows, columns = (range(at - half, at + half + 1) for at in (row, column))
-        good = part(~mask, rows, columns) * 1.0
-        above = part(image, rows, columns) - part(background, rows, columns)
-        light = fftconvolve(good * above, seen, "valid")
-        squares = fftconvolve(good, seen**2, "valid").clip(min=(psf**2).sum() / 4.0)
-        significance = light.clip(min=0.0) / (noise * np.sqrt(squares))
+        found = fftconvolve(part(light, rows, columns), seen, "valid").clip(min=0.0)
+        squares = fftconvolve(part(~mask, rows, columns), seen**2, "valid")
+        significance = found / (noise * np.sqrt(squares.clip(min=(psf**2).sum() / 4.0)))
         total += map_coordinates(significance, [y + at_y - row, x + at_x - column]) ** 2
     return np.sqrt(total)
 
