@@ -66,7 +66,7 @@ def test_noise_alone_is_not_significant_and_spread_as_its_variance_says():
     assert abs(z.mean()) < 0.25  # three standard errors of a mean of 200 are 0.21
     assert z.std() == pytest.approx(1.0, abs=0.15)
     assert not any(each.is_significant for each in found)
-    assert found[0].expected == pytest.approx(float(found[0].squares.sum()), rel=0.5)
+    assert found[0].expected == pytest.approx(found[0].squares, rel=0.5)
 
 
 def test_it_is_the_formula():
@@ -77,7 +77,7 @@ def test_it_is_the_formula():
     weight = np.where(light > 0.5 * model, light**2 / model / (model + 0.5), 0.0)
     np.testing.assert_allclose(found.squares, (weight * (counts - model) ** 2 / model).sum())
     np.testing.assert_allclose(found.expected, weight.sum())
-    np.testing.assert_allclose(found.variance, (weight**2 * (2.0 + 1.0 / model)).sum())
+    np.testing.assert_allclose(found.variances, (weight**2 * (2.0 + 1.0 / model)).sum())
     np.testing.assert_allclose(found.norm, (weight * light**2 / model).sum())
     number = Rings((N, N), np.array([STAR])).number == 2
     excess = (weight * ((counts - model) ** 2 / model - 1.0))[number].sum()
@@ -152,8 +152,8 @@ class TestImagesThatDiffer:
         return Scene(observation, [self.PLACE])
 
     def test_the_misfit_is_the_formula(self):
-        scene, squares = self.scene(), np.zeros(2)
-        expected = excess = norm = 0.0
+        scene, (squares, expected, variances) = self.scene(), np.zeros((3, 2))
+        excess = norm = 0.0
         scaled, flux = SKY / scene.unit, np.array([self.LIGHT / scene.unit])
         given, settled = (
             Estimate.of_scaled(scene, a * scaled, b * flux) for a, b in ((1.0, 1.0), (1.2, 0.9))
@@ -166,13 +166,15 @@ class TestImagesThatDiffer:
             weight = np.where(light > 0.5 * model, light**2 / model / (model + 0.5), 0.0)
             weight *= ~self.BAD[j]
             squares[j] = (weight * left**2 / model).sum()
-            expected += weight.sum()
+            expected[j] = weight.sum()
+            variances[j] = (weight**2 * (2.0 + 1.0 / model)).sum()
             sums = weight * (left**2 / model - 1.0), weight * light**2 / model
             excess, norm = (
                 a + each[rings == 1].sum() for a, each in zip((excess, norm), sums, strict=True)
             )
         np.testing.assert_allclose(found.squares, squares)
         np.testing.assert_allclose(found.expected, expected)
+        np.testing.assert_allclose(found.variances, variances)
         assert excess > 0
         np.testing.assert_allclose(found.in_rings[1], np.sqrt(excess / norm))
 

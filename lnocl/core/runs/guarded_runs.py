@@ -167,7 +167,8 @@ class GuardedRuns:
         setup = replace(self.setup_of(psfs, stars), refine_positions=moves)
         with ignored_warnings(), ignored_notes():  # those of the reconstruction are the same
             start = settle_halos(make_start(setup, Penalty()))
-            nothing_measured = PsfMisfit(np.array([error**2]), 0.0, 0.0, 1.0, np.array([error]))
+            none = np.zeros(1)
+            nothing_measured = PsfMisfit(none + error**2, none, none, 1.0, none + error)
             found = _judged(start.estimate(), nothing_measured)
             moved = replace(setup, refine_positions=False)
             rounds = (moved, FIRST_ITERATIONS), *[(setup, ITERATIONS)] * (MAX_ROUNDS - 1)
@@ -192,11 +193,10 @@ class GuardedRuns:
             self._steady = {key: (found, psfs)}
         return self._steady[key][0]
 
-    def settled(self, psfs: Psfs, stars: Array, moves: bool) -> tuple[Psfs, Array, Array]:
+    def settled(self, psfs: Psfs, stars: Array, moves: bool) -> tuple[Psfs, Array]:
         """Return PSFs, of the whole images, and stars, in the window, as the images show them.
 
-        Those given are returned where they stay. Stars stay unless they may move. The third is the
-        fluxes of the stars through the PSFs given, electrons; none where they stay.
+        Those given are returned where they stay. Stars stay unless they may move.
         """
         setup = self.setup_of(psfs, stars)
 
@@ -207,12 +207,11 @@ class GuardedRuns:
 
         steps, found = settle_psfs(setup, moves, run)
         if not steps:
-            return psfs, stars, np.zeros(0)
-        whole, before = self.whole.observation.replace(psfs=psfs), run(setup)
+            return psfs, stars
+        whole = self.whole.observation.replace(psfs=psfs)
         for step in steps:
             whole = with_errors(whole, step)
-        moved = np.where(found == setup.stars, stars, found)
-        return whole.psfs_over_images, moved, before.star_fluxes[: before.scene.n_stars]
+        return whole.psfs_over_images, np.where(found == setup.stars, stars, found)
 
     def _run(self, setup: Setup, found: Judged, n_iter: int, guard: float) -> Judged:
         """Return the estimate after a run that begins at `found`, with its misfit measured anew.

@@ -24,12 +24,13 @@ from lnocl.core.scene.cores import fwhm
 from lnocl.core.scene.observation import Observation
 from lnocl.core.scene.psf_families import PsfFamilies, PsfParameters
 from lnocl.core.scene.psf_faults import name_faults
-from lnocl.core.scene.psf_field import Psfs, mapped
+from lnocl.core.scene.psf_field import Psfs, either, mapped
 from lnocl.core.scene.psf_misfit import PsfMisfit
 from lnocl.core.scene.psf_wings import are_noisy, without_noise
 from lnocl.core.scene.psfs import MOST_PSF_ERROR
 from lnocl.core.scene.star_psfs import owned
 from lnocl.core.solvers.companions import Companion, companions
+from lnocl.core.solvers.psf_errors import alike
 from lnocl.core.solvers.psf_fit import step
 from lnocl.errors import DivergedError, NotFiniteError, counted, detail, note, warn
 from lnocl.process import ignored_notes, ignored_warnings
@@ -97,7 +98,7 @@ class _State:
         before, after = self.misfit, other.misfit
         if (other.star_fluxes < FADED * self.star_fluxes).any():
             return False  # a sharper PSF, and the star's light in the extended source
-        if after.expected < FADED * before.expected:
+        if after.expected.sum() < FADED * before.expected.sum():
             return False  # stars that dominate nowhere show no misfit
         is_less = before.significance - after.significance > GONE
         return is_less and (not after.is_doubtful or after.kappa < MENDED * before.kappa)
@@ -109,7 +110,7 @@ def mend(runs: GuardedRuns, names: Sequence[str], moves: bool | str, is_asked: b
     Points beside the stars, which PSFs that may have an error would follow, are held meanwhile. The
     noise of PSFs that have negative pixels, but for exact ones that fit, is taken from their wings
     first, unless they fit worse so. PSFs that may have an error then become the mean of what the
-    stars show of it (`lnocl.core.runs.psf_posterior`), unless they are in doubt and fit worse so.
+    stars show of it (`lnocl.core.runs.psf_posterior`), each where its images fit better so.
     Where they are off by no more than that error holds, neither jitter nor pixels are fitted
     unasked, and stars take their marginal fluxes. Where they are off by more, the error is raised
     at the end to what holds it.
@@ -235,27 +236,34 @@ def _beside_stars(runs: GuardedRuns) -> Array:
     places = runs.first + np.reshape([each.place for each in found], (-1, 2))
     if len(places):
         named = " ".join(f"({x:.4g}, {y:.4g})" for x, y in places)
-        number = counted(len(places), "point")
-        note(f"{number} beside stars held while PSFs are fitted, {named}: name what is a star")
+        points = counted(len(places), "point")
+        note(f"{points} beside stars held while PSFs are fitted, {named}: name what is a star")
     return np.asarray(places, np.float64)
 
 
 def _settle(runs: GuardedRuns, state: _State, moves: bool) -> _State:
-    """Return the state with PSFs that are the mean of what they may be, unless they fit worse.
+    """Return the state with PSFs that are the mean of what they may be, where they fit better.
 
-    Those before are judged too where these are in doubt, or a star has lost its light to them.
-    Stars that were moved are moved again for these, but where they follow a host from a flat sky.
+    That mean takes the extended source to be as smooth as its prior. Where it is not, PSFs that are
+    right would follow it, and their images fit worse: each PSF stays that fits no better so. None
+    is used with which all fit worse, or a star loses its light. Stars that were moved are moved
+    again for these, but where they follow a host from a flat sky.
     """
-    psfs, stars, before = runs.settled(state.psfs, state.places, moves)
+    psfs, stars = runs.settled(state.psfs, state.places, moves)
     is_moved = bool((stars != state.places).any())
     if psfs is state.psfs and not is_moved:
         return state
     settled = _State.of(runs, psfs, stars, state.moves or is_moved)
+    numbers, rise = alike(runs.whole.observation), settled.misfit.excess - state.misfit.excess
+    stays = (np.bincount(numbers, rise) >= 0)[numbers]
+    if stays.all() and not is_moved:
+        return state
+    if stays.any():
+        psfs = either(stays, state.psfs, psfs)
+        settled = _State.of(runs, psfs, stars, settled.moves)
     if is_moved and settled.misfit.is_doubtful:
         stay = replace(_State.of(runs, psfs, stars, state.moves), moves=True)
         settled = min(settled, stay, key=lambda each: each.misfit.significance)
-    if not settled.misfit.is_doubtful and (settled.star_fluxes >= FADED * before).all():
-        return settled
     is_worse = settled.misfit.significance > state.misfit.significance + GONE
     is_faded = (settled.star_fluxes < FADED * state.star_fluxes).any()
     return state if is_worse or is_faded else settled
@@ -267,8 +275,7 @@ def _clean(runs: GuardedRuns, state: _State) -> _State:
     Noise of wings hands the light of stars to the extended source, which it spreads, and nothing of
     that shows at the stars.
     """
-    q = runs.observation.oversample
-    psfs = mapped(state.psfs, lambda _, stack: without_noise(stack, q))
+    psfs = mapped(state.psfs, lambda _, each: without_noise(each, runs.observation.oversample))
     cleaned = _State.of(runs, psfs, state.places, state.moves)
     is_worse = cleaned.misfit.significance > state.misfit.significance + GONE
     return state if is_worse else cleaned
@@ -381,9 +388,7 @@ def _tell_widths(observation: Observation, psfs: Psfs) -> None:
     fitted = observation.replace(psfs=psfs).psfs
     pairs = zip(fitted, observation.psfs, strict=True)
     widths = [100.0 * (fwhm(after) / fwhm(before) - 1.0) for after, before in pairs]
-    words = f"{min(widths):+.1f}"
-    if f"{max(widths):+.1f}" != words:
-        words += f" to {max(widths):+.1f}"
+    words = " to ".join(dict.fromkeys(f"{width:+.1f}" for width in (min(widths), max(widths))))
     note(f"PSFs fitted to the stars: {words} % in width (`psf_error` 0 leaves them)")
 
 

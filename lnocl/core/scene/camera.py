@@ -203,8 +203,12 @@ class Camera(LinearMap):
         return self._transform(self.rotation.adjoint(spread(image, self._oversample)), ...)
 
     def point(self) -> Array:
-        """Return what the image has of a point at the origin, shape (Ny, Nx)."""
-        return self._scene.point_response(self._j)
+        """Return what the image has of a point at the origin, shape (Ny, Nx).
+
+        Where images are turned `Scene.psf` has what their weights need besides; its squares mean
+        nothing.
+        """
+        return self._scene.psf_cutout(self._j).on_grid(self._scene.grid)
 
     def squares(self, image: Array, elements: Array | None = None, power: int = 2) -> Array:
         """Return ``(A_j^2)^T x``, with the squares of the elements of A_j, for x not below 0.

@@ -8,7 +8,7 @@ from functools import partial
 from typing import Any, TypeVar
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from lnocl.core.scene.arrays import Array, numbers
 from lnocl.core.scene.quantities import bare, in_unit
@@ -215,6 +215,13 @@ def mapped(psfs: Kind, function: Callable[[int, Array], Array]) -> Kind:
     if isinstance(psfs, tuple):
         return tuple(field.mapped(partial(function, j)) for j, field in enumerate(psfs))
     return np.array([function(j, psf[None])[0] for j, psf in enumerate(psfs)])
+
+
+def either(is_first: NDArray[np.bool_], first: Psfs, second: Psfs) -> Psfs:
+    """Return the first PSFs of the images where these are wanted, else the second."""
+    pairs = zip(is_first, first, second, strict=True)
+    chosen = [one if is_wanted else other for is_wanted, one, other in pairs]
+    return tuple(chosen) if isinstance(first, tuple) else np.array(chosen)
 
 
 def read_fields(psfs: Any, n_images: int, oversample: int, are_effective: bool) -> list[PsfField]:

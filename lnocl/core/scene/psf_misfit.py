@@ -42,10 +42,8 @@ class PsfMisfit(NamedTuple):
 
     Attributes
     ----------
-    squares : ndarray of float64, shape (p,)
-        chi squared of each image.
-    expected, variance : float
-        What noise alone gives, for all images, and its variance.
+    squares, expected, variances : ndarray of float64, shape (p,)
+        chi squared of each image, what noise alone gives, and its variance.
     norm : float
         ``sum w S^2 / m``.
     in_rings : ndarray of float64
@@ -53,21 +51,26 @@ class PsfMisfit(NamedTuple):
     """
 
     squares: Array
-    expected: float
-    variance: float
+    expected: Array
+    variances: Array
     norm: float
     in_rings: Array
 
     @property
+    def excess(self) -> Array:
+        """Chi squared of each image over its expectation, shape (p,)."""
+        return self.squares - self.expected
+
+    @property
     def reduced(self) -> float:
         """Chi squared over its expectation: 1 where there is noise alone."""
-        return float(self.squares.sum()) / self.expected if self.expected else 1.0
+        expected = float(self.expected.sum())
+        return float(self.squares.sum()) / expected if expected else 1.0
 
     @property
     def significance(self) -> float:
         """The excess of chi squared in standard deviations of noise."""
-        excess = float(self.squares.sum()) - self.expected
-        return excess / math.sqrt(self.variance) if self.variance else 0.0
+        return float(self.excess.sum()) / self._deviation if self._deviation else 0.0
 
     @property
     def is_doubtful(self) -> bool:
@@ -82,12 +85,16 @@ class PsfMisfit(NamedTuple):
     @property
     def kappa(self) -> float:
         """The relative error of the PSFs that the excess shows."""
-        return _kappa(float(self.squares.sum()) - self.expected, self.norm)
+        return _kappa(float(self.excess.sum()), self.norm)
 
     @property
     def hidden(self) -> float:
         """The relative error of PSFs whose excess is one standard deviation of noise."""
-        return _kappa(math.sqrt(self.variance), self.norm)
+        return _kappa(self._deviation, self.norm)
+
+    @property
+    def _deviation(self) -> float:
+        return math.sqrt(float(self.variances.sum()))
 
 
 def measure_misfit(estimate: Estimate, model: Model, settled: Estimate) -> PsfMisfit:
@@ -107,7 +114,7 @@ def measure_misfit(estimate: Estimate, model: Model, settled: Estimate) -> PsfMi
     inside = tuple(map(slice, scene.observation.shape))
     means = model.images(estimate.extended, fluxes)
     found = model.forward(settled.extended) + model.background
-    squares, parts = np.zeros(scene.n_images), list[tuple[Array, ...]]()
+    of_images, parts = list[tuple[float, ...]](), list[tuple[Array, ...]]()
     images = zip(
         scene.images(),
         model.starlight(_of_stars(estimate)),
@@ -126,9 +133,9 @@ def measure_misfit(estimate: Estimate, model: Model, settled: Estimate) -> PsfMi
         total *= electrons
         weight = squared * total / (total + 0.5)
         left = weight * residuals**2 / total
-        squares[j] = left.sum()
         rings = Rings(scene.observation.shape, scene.star_field.places[j])
         variance = weight**2 * (2.0 + 1.0 / total)
+        of_images.append(tuple(map(np.sum, (left, weight, variance))))
         parts.append((rings.number[seen], left - weight, variance, weight * squared * total))
     number, excess, variance, norm = (np.concatenate(each) for each in zip(*parts, strict=True))
     sums = [np.bincount(number, each) for each in (excess, variance, norm)]
@@ -136,13 +143,8 @@ def measure_misfit(estimate: Estimate, model: Model, settled: Estimate) -> PsfMi
         _kappa(e, n) if e > SIGNIFICANT_IN_RING * math.sqrt(v) else 0.0
         for e, v, n in zip(*sums, strict=True)
     ]
-    return PsfMisfit(
-        squares,
-        float(squares.sum() - excess.sum()),
-        float(variance.sum()),
-        float(norm.sum()),
-        np.array(in_rings),
-    )
+    squares, expected, variances = np.transpose(of_images)
+    return PsfMisfit(squares, expected, variances, float(norm.sum()), np.array(in_rings))
 
 
 def smoothing_near_stars(

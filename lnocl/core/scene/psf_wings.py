@@ -41,9 +41,8 @@ def without_noise(psfs: Array, oversample: int = 1) -> Array:
     ky, kx = psfs.shape[1:]
     rings = Rings((ky, kx), np.array([(kx // 2, ky // 2)]), oversample)
     pixels = rings.sums(np.ones((ky, kx)))
-    is_far = np.hypot(*np.ogrid[-(ky // 2) : ky - ky // 2, -(kx // 2) : kx - kx // 2]) > (
-        FAR * (min(ky, kx) // 2)
-    )
+    y, x = np.ogrid[-(ky // 2) : ky - ky // 2, -(kx // 2) : kx - kx // 2]
+    is_far = np.hypot(y, x) > FAR * (min(ky, kx) // 2)
     cleaned = np.empty_like(psfs)
     for psf, clean in zip(psfs, cleaned, strict=True):
         light = rings.sums(psf)

@@ -485,13 +485,6 @@ class Scene:
         spectrum = scipy.fft.rfft2(psf) * self.rotations[j].undone()
         return np.asarray(scipy.fft.irfft2(spectrum, self.grid))
 
-    def point_response(self, j: int) -> Array:
-        """Return what image j shows of a point at the origin, on the sky's grid, shape (Ny, Nx).
-
-        Where images are turned `psf` has what their weights need besides; its squares mean nothing.
-        """
-        return self.psf_cutout(j).on_grid(self.grid)
-
     def psf_cutout(self, j: int) -> Cutout:
         """Return the response of image j where it is not 0, the sky moved by the offset.
 
@@ -511,10 +504,6 @@ class Scene:
     def star_cutout(self, j: int, s: int) -> Cutout:
         """Return P_js, where it is not 0."""
         return self._field.cutouts[j][s]
-
-    def star_on_sky(self, j: int, s: int) -> Cutout:
-        """Return P_js before the pixels of image j sample it, on the sky's grid."""
-        return self._field.psfs[j][s].on_sky(*self._field.places[j][s])
 
     def psf_on_sky(self, j: int, s: int) -> Cutout:
         """Return PSF j on the sky's grid, at star s."""

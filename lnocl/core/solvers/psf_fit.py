@@ -156,7 +156,7 @@ def _psf_slopes(
     else:
         light = diffuse.copy()
         for s in np.flatnonzero(scene.shown[:, j] & scene.through_psfs).tolist():
-            star = scene.star_on_sky(j, s)
+            star = scene.star_field.psfs[j][s].on_sky(*scene.star_field.places[j][s])
             light[star.window(scene.grid)] += fluxes[s] * star.values
         whole = scipy.fft.rfft2(light)
         sky = _sky(model, j, estimate.extended, fluxes) if modes else whole
