@@ -210,12 +210,10 @@ def residuals(image: Array, mask: NDArray[np.bool_], model: Array) -> Array:
     return np.divide(values, np.sqrt(model, where=usable, out=np.ones_like(model)), out=values)
 
 
-def judge(observation: Observation, models: Iterable[Array]) -> Fit:
-    """Return how well the models m_j, each of shape (ny, nx), fit all good pixels."""
-    overall = Fit()
-    for image, mask, model in zip(observation.images, observation.mask, models, strict=True):
-        overall = overall.plus(Fit.of(residuals(image, mask, model), model))
-    return overall
+def judge(observation: Observation, models: Iterable[Array]) -> list[Fit]:
+    """Return how well the models m_j, each of shape (ny, nx), fit the good pixels of each image."""
+    images = zip(observation.images, observation.mask, models, strict=True)
+    return [Fit.of(residuals(image, mask, model), model) for image, mask, model in images]
 
 
 def judge_stars(estimate: Estimate) -> list[StarResiduals]:

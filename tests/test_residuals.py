@@ -1,6 +1,7 @@
 """Whether models fit: residuals in all pixels, at stars, and the light that lies round these."""
 
 import tracemalloc
+from functools import reduce
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ import lnocl
 from lnocl.core.scene.estimate import Estimate
 from lnocl.core.scene.scene import Scene
 from lnocl.core.scene.shifting import place
+from lnocl.errors import InputError
 from lnocl.residuals import CORE, WINGS, Fit, _halo, judge, judge_stars, residuals, sharp_sources
 
 # The PSFs are cut off.
@@ -87,10 +89,11 @@ def test_fitting_model_of_few_counts_has_a_good_verdict():
 
 def test_pixels_are_those_of_the_images(known):
     observation, scene, models = known
-    overall, at_stars = (
+    of_images, at_stars = (
         judge(observation, models),
         judge_stars(Estimate(scene, no_sky(scene), FLUXES)),
     )
+    overall = reduce(Fit.plus, of_images)
     good = ~observation.mask
     squares = (observation.images - models) ** 2 / (models + 0.5)
     assert overall.n_pixels == good.sum()
@@ -131,7 +134,7 @@ def test_a_misfit_is_found_where_it_is(known, wrong):
     )
     assert not at_stars[1].core.is_misfit
     assert not at_stars[1].wings.is_misfit
-    assert judge(changed, models).rms > 1.0
+    assert judge(changed, models)[0].rms > 1.0
 
 
 def test_a_star_without_good_pixels_has_no_rms():
@@ -242,9 +245,20 @@ def test_a_result_has_the_residuals():
     made = Recipe((8, 16), 2, 1).make()
     result = made.deconvolve(n_iter=3, engine="numpy")
     observation = made.observation()
-    assert result.fit() == judge(observation, result.models())
+    assert result.fit() == reduce(Fit.plus, judge(observation, result.models()))
     expected = (observation.images - result.models()) / np.sqrt(result.models())
     np.testing.assert_allclose(result.residuals(), expected, rtol=1e-12, atol=1e-12)
+
+
+def test_a_result_has_the_fit_of_each_epoch():
+    made = Recipe((8, 16), 3, 1).make()
+    observation = made.observation().replace(epochs=[57000.5, 57001, 57000.5])
+    result = paper(observation, made.stars, n_iter=2, engine="numpy")
+    first, second, third = judge(observation, result.models())
+    assert result.fit(57000.5) == first.plus(third)
+    assert result.fit("57001") == second
+    with pytest.raises(InputError, match=r"`epoch` is 'May'; give one of 57000.5, 57001"):
+        result.fit("May")
 
 
 @pytest.mark.parametrize("finer", [1, 2])

@@ -5,7 +5,8 @@ from __future__ import annotations
 import os
 from collections.abc import Iterable
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, reduce
+from itertools import compress
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -14,7 +15,7 @@ from numpy.typing import NDArray
 from lnocl.core.runs.outcome import Outcome, PsfRefinement
 from lnocl.core.scene.arrays import Array
 from lnocl.core.scene.observation import Observation
-from lnocl.errors import counted, with_names
+from lnocl.errors import InputError, counted, with_names
 from lnocl.notebook import html_card
 from lnocl.plotting.result import draw_result
 from lnocl.residuals import Fit, StarResiduals, judge, residuals
@@ -456,31 +457,48 @@ class Result(Measured):
             rows.append((f"halo {k}", amount))
         return rows
 
-    def fit(self) -> Fit:
-        """Return how well the model fits all good pixels.
+    def fit(self, epoch: str | float | None = None) -> Fit:
+        """Return how well the model fits all good pixels, or those of an epoch.
 
         It takes a convolution of each image in double precision on the host.
+
+        Parameters
+        ----------
+        epoch : str or float, optional
+            Its label, as given to `lnocl.Observation`.
 
         Returns
         -------
         Fit
             The sum of the squared residuals, their rms and its error, `lnocl.residuals.Fit`.
 
+        Raises
+        ------
+        InputError
+            No epoch has this label.
+
         Examples
         --------
         >>> import numpy as np
         >>> import lnocl
         >>> image = np.random.default_rng(0).poisson(100.0, (32, 32))
-        >>> observation = lnocl.Observation(image, np.ones((5, 5)))
+        >>> images, nights = [image, image], ["May", "June"]
+        >>> observation = lnocl.Observation(images, np.ones((5, 5)), epochs=nights)
         >>> result = lnocl.deconvolve(observation, stop=None, n_iter=1, engine="numpy")
         >>> fit = result.fit()
         >>> fit.n_pixels, bool(0.9 < fit.rms < 1.1), fit.is_misfit
-        (1024, True, False)
+        (2048, True, False)
+        >>> result.fit("June").n_pixels
+        1024
         """
-        return self._fit
+        labels = self._observation.epoch_labels
+        is_wanted = [epoch is None or labels[k] == str(epoch) for k in self._observation.epochs]
+        if not any(is_wanted):
+            raise InputError(f"`epoch` is {epoch!r}; give one of {', '.join(labels)}")
+        return reduce(Fit.plus, compress(self._fits, is_wanted))
 
     @cached_property
-    def _fit(self) -> Fit:
+    def _fits(self) -> list[Fit]:
         return judge(self._observation, self._findings.models())
 
     def star_residuals(self) -> list[StarResiduals]:
