@@ -93,6 +93,12 @@ def spelled(names: Iterable[str], *wanted: str) -> list[str] | None:
     return [first for (first,) in found]
 
 
+def once_each(table: Any) -> Any:
+    """Return a table with each star once: those of lnocl have a row for each of several epochs."""
+    is_by_epoch = {"epoch", "variation_error"} <= {*table.colnames}
+    return table[table["epoch"] == 0] if is_by_epoch else table
+
+
 def in_pixels(table: Any, columns: Columns, name: str) -> Array:
     """Return positions (x, y), pixels, 0-based, shape (n, 2).
 
@@ -129,7 +135,7 @@ def positions(table: Any, name: str = "stars") -> Array:
             f"{', '.join(table.colnames) or 'no columns'}: rename two, or convert RA and Dec with "
             "world_to_pixel of astropy.wcs"
         )
-    return in_pixels(table, columns, name)
+    return in_pixels(once_each(table), columns, name)
 
 
 def column_numbers(column: Any, name: str, unit: str) -> Array:
