@@ -313,7 +313,7 @@ def flat(**pixels):
     ("call", "message"),
     [
         (lambda: load_target("hh35"), "'hh35' is neither a built-in one .hh34. nor a file"),
-        (lambda: hh34(255), "255 x 255 pixels; each side must be even"),
+        (lambda: hh34(255), "255 x 255 pixels; sides must be whole, even"),
         (lambda: hh34(62), "64 or more"),
         (lambda: Target(np.ones((30, 32))), "32 or more"),
         (lambda: hh34(64.0), "even"),

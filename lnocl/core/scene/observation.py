@@ -119,9 +119,9 @@ class Observation:
         The epoch of each image, such as its night: numbers or text. Stars have a flux in each
         epoch, the rest of the sky is common. By default all images are of one epoch.
     oversample : {1, 2, 4}, optional
-        Pixels of the sky, and of the PSFs, to one of the images along each axis, for detectors with
-        fewer than two pixels to the PSF's width. Offsets of fractions of a pixel then add
-        resolution.
+        Pixels of the sky, and of the PSFs, to one of the images along each axis. It is for
+        detectors with fewer than two pixels to the PSF's width. Offsets of fractions of a pixel
+        then add resolution.
 
         The model of a pixel is the sum over its pixels of the sky. Positions and offsets stay in
         pixels of the images.
@@ -229,13 +229,13 @@ class Observation:
           the sum of a PSF is more than 1.
         - Images or background exceed 1e30 electrons in a pixel, with exposure and read noise.
         - No good pixel is left, or an offset leaves nothing of an image.
-        - `psf_error` is not from 0 to 0.3.
+        - `psf_error` is not from 0 to 0.3, or `psf_centre` is not one of its three.
         - A halo is 0 on all good pixels of an image.
         - `transmission` is not of the sky's shape, out of range, or 0 everywhere in the images that
           have good pixels.
         - A label of `epochs` is missing or not a number, or the labels have no order.
-        - `transforms` are given beside `offsets`, shear the images by more than 0.05 pixels, or are
-          for pixels smaller than those of the image that the sky is of.
+        - `transforms` are given beside `offsets`, or shear the images by more than 0.05 pixels.
+        - Pixels of an image are smaller than those of the sky, by its transform.
 
     Warns
     -----
@@ -251,7 +251,7 @@ class Observation:
     References
     ----------
     D. L. Snyder, A. M. Hammoud, R. L. White, J. Opt. Soc. Am. A 10, 1014 (1993), for the read
-    noise; La Camera et al. (2012), Eq. 1 and 7, for the model.
+    noise; La Camera et al. (2012), Eq. 1 and 6, for the model.
 
     Examples
     --------

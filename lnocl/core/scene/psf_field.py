@@ -19,22 +19,23 @@ class PsfField:
     """PSFs that vary over an image, given at the nodes of a grid of positions.
 
     Between four nodes the PSF is bilinear, ``K = sum_i w_i K_i``, with weights w_i that sum to 1,
-    as `photutils.psf.GriddedPSFModel` defines it. Beyond the nodes it is constant.
+    as `photutils.psf.GriddedPSFModel` defines it. Beyond the nodes it is that of the nearest place
+    of the grid.
 
     Parameters
     ----------
     psfs : array_like, shape (n, ky, kx)
-        PSF of each node, with its centre at ``(ky // 2, kx // 2)``. `lnocl.Observation` normalises
-        the sums to 1.
+        PSF of each node, with its centre at ``(ky // 2, kx // 2)``, held as it is given.
+        `lnocl.Observation` normalises the sum of each to 1, and refuses what cannot be a PSF.
     positions : array_like, shape (n, 2)
-        (x, y) of the nodes, pixels of the image, 0-based. They fill a rectangular grid. They may be
-        a Quantity in pixels.
+        (x, y) of the nodes, pixels of the image, 0-based, in any order. They fill a rectangular
+        grid of one node or more. They may be a Quantity in pixels.
 
     Raises
     ------
     InputError
-        The shapes do not agree, positions are not finite or not in pixels, or they do not fill a
-        grid.
+        - The shapes do not agree, or a value is masked or not a real number.
+        - Positions are not finite, not in pixels, or do not fill a grid.
 
     See Also
     --------
@@ -122,7 +123,10 @@ class PsfField:
         return self._x, self._y
 
     def numbers(self) -> Array:
-        """Return all numbers that it holds, for a checksum."""
+        """Return the PSFs, row by row of the grid, and the x and y of its lines, in one dimension.
+
+        They differ where two fields do, so that a checksum of them tells fields apart.
+        """
         return np.concatenate([self._psfs.ravel(), self._x, self._y])
 
     @property
