@@ -423,7 +423,7 @@ class TestAScatterThatIsGiven:
 
     def test_without_a_star_nothing_is_judged_by_it(self):
         observation = lnocl.Observation(images_through([PSF]), PSF, psf_scatter=PSF)
-        assert not lnocl.plan(observation).judges_psfs
+        assert not lnocl.plan(observation).does("judge PSFs before the run")
 
     @pytest.mark.exhaustive
     def test_psfs_that_may_have_an_error_are_as_right_as_without_it(self):
