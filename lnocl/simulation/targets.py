@@ -12,7 +12,7 @@ from astropy import units as u
 from numpy.typing import ArrayLike
 from scipy.special import expit
 
-from lnocl.core.scene.arrays import unmasked
+from lnocl.core.scene.arrays import numbers
 from lnocl.core.scene.quantities import bare
 from lnocl.errors import InputError
 from lnocl.io import fitsread
@@ -84,14 +84,8 @@ class Target:
     """
 
     def __init__(self, extended: ArrayLike, stars: Sequence[Star] = ()) -> None:
-        array = unmasked("the extended source", bare("the extended source", extended))
-        if array.ndim != 2 or array.dtype.kind not in "biuf":
-            raise InputError(
-                f"the extended source has {array.ndim} dimensions of {array.dtype}; "
-                "give two, of real numbers"
-            )
+        array = numbers("the extended source", bare("the extended source", extended))
         check_shape(array.shape)
-        array = array.astype(np.float64)
         if not (np.isfinite(array).all() and (array >= 0).all()):
             raise InputError("the extended source must be finite and not negative everywhere")
         with np.errstate(over="ignore"):

@@ -319,7 +319,7 @@ def flat(**pixels):
         (lambda: hh34(64.0), "even"),
         (lambda: Target(np.zeros((32, 32))), "no flux"),
         (lambda: Target(np.ones((32, 33))), "33 x 32"),
-        (lambda: Target(np.ones((3, 32, 32))), "3 dimensions"),
+        (lambda: Target(np.ones((3, 32, 32))), r"shape must be \(ny, nx\)"),
         (lambda: Target(flat(first=-1)), "not negative"),
         (lambda: Target(flat(first=math.nan)), "finite"),
         (lambda: Target(1e306 * flat()), "too large to be summed: divide it by a constant"),
