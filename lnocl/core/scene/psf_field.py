@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike
 
-from lnocl.core.scene.arrays import Array, numbers
+from lnocl.core.scene.arrays import Array, numbers, whole
 from lnocl.core.scene.quantities import bare, in_unit
 from lnocl.errors import InputError, counted
 
@@ -113,9 +113,8 @@ class PsfField:
         """
         x, y = in_unit("x", x, "pix"), in_unit("y", y, "pix")
         (i, u), (j, v) = _between(self._x, x), _between(self._y, y)
-        weights = np.outer(v, u)
         cell = self._psfs[j : j + len(v), i : i + len(u)]
-        return np.asarray(np.tensordot(weights, cell, axes=2))
+        return np.asarray(np.tensordot(np.outer(v, u), cell, axes=2))
 
     @property
     def nodes(self) -> tuple[Array, Array]:
@@ -176,7 +175,13 @@ class PsfField:
         Returns
         -------
         PsfField
-            The model's PSFs, sampled at that interval at the nodes of the model.
+            The PSFs at the nodes of the model, sampled at that interval from their centre on, as
+            far as the model's samples reach. Values are the model's, of a flux of 1.
+
+        Raises
+        ------
+        InputError
+            `oversample` is not a whole number, 1 or more.
 
         Examples
         --------
@@ -189,6 +194,7 @@ class PsfField:
         >>> PsfField.of_model(model, oversample=2).shape
         (9, 9)
         """
+        whole("oversample", oversample, 1)
         sizes = np.array(model.data.shape[1:]) / model.oversampling * oversample
         half_y, half_x = ((sizes - 1) // 2).astype(int).tolist()
         y, x = np.mgrid[-half_y : half_y + 1, -half_x : half_x + 1] / oversample
