@@ -203,7 +203,8 @@ def flux_profile(image: ArrayLike, star: tuple[int, int] | None = None) -> Array
     image : array_like, shape (ny, nx)
         Source whose axis lies along y.
     star : (x, y), optional
-        Position of the star in the image of both (RLM); the 3 rows around it are masked.
+        Position of the star, a whole pixel, in the image of both (RLM). The 3 rows around it are
+        masked.
 
     Returns
     -------
@@ -213,7 +214,8 @@ def flux_profile(image: ArrayLike, star: tuple[int, int] | None = None) -> Array
     Raises
     ------
     InputError
-        The image is not a plane of finite, unmasked numbers, or a masked row lies outside it.
+        The image is not a plane of finite, unmasked numbers, or the star is not at a whole pixel,
+        one or more from its edge.
 
     References
     ----------

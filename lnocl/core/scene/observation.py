@@ -458,10 +458,23 @@ class Observation:
         return good_box(self.mask[j])
 
     def on_fine_pixels(self, j: int) -> tuple[Array, Array, Box]:
-        """Return the map from the sky to image j, and its `good_box`, in pixels as fine as the sky.
+        """Return the map from pixels of the sky to fine pixels of image j, and its box of them.
 
-        Those of the image are numbered from the middle of its first, and its own are each
-        `oversample`-th of them. So pixel u of the sky is at ``M u + t``, shapes (2, 2) and (2,).
+        Fine pixels are `oversample` times as fine as the image's, as those of the sky are. They are
+        counted from the centre of the image's first pixel, so that its pixel x is fine pixel
+        ``oversample * x``.
+
+        Parameters
+        ----------
+        j : int
+            The image, from 0 on.
+
+        Returns
+        -------
+        M, t : ndarray of float64, shapes (2, 2) and (2,)
+            Pixel u = (x, y) of the sky, 0-based, is at ``M u + t``.
+        box : (range, range)
+            Rows and columns of fine pixels, those of `good_box`.
         """
         q, turn = self.oversample, self.turns[j]
         rows, columns = (range(q * at.start, q * at.stop) for at in self.good_box(j))
@@ -601,7 +614,19 @@ class Observation:
         return other._closed()
 
     def transmission_of(self, rows: range, columns: range) -> Array:
-        """Return that of rows and columns of the sky; beyond its frame that of the nearest."""
+        """Return the `transmission` of some rows and columns of the sky.
+
+        Parameters
+        ----------
+        rows, columns : range
+            In pixels of the images, 0-based. Beyond the frame of the sky the transmission is that
+            of the nearest pixel.
+
+        Returns
+        -------
+        ndarray of float64, shape (p, q len(rows), q len(columns))
+            With q for `oversample`; of shape (0, 0, 0) where no transmission was given.
+        """
         given, q = self.transmission, self.oversample
         if not len(given):
             return given

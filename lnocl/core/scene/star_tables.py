@@ -93,10 +93,9 @@ def spelled(names: Iterable[str], *wanted: str) -> list[str] | None:
     return [first for (first,) in found]
 
 
-def once_each(table: Any) -> Any:
+def once_each(rows: Any) -> Any:
     """Return a table with each star once: those of lnocl have a row for each of several epochs."""
-    is_by_epoch = {"epoch", "variation_error"} <= {*table.colnames}
-    return table[table["epoch"] == 0] if is_by_epoch else table
+    return rows[rows["epoch"] == 0] if {"epoch", "variation_error"} <= {*rows.colnames} else rows
 
 
 def in_pixels(table: Any, columns: Columns, name: str) -> Array:
