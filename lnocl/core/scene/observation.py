@@ -119,9 +119,9 @@ class Observation:
         The epoch of each image, such as its night: numbers or text. Stars have a flux in each
         epoch, the rest of the sky is common. By default all images are of one epoch.
     oversample : {1, 2, 4}, optional
-        Pixels of the sky, and of the PSFs, to one of the images along each axis. It is for
-        detectors with fewer than two pixels to the PSF's width. Offsets of fractions of a pixel
-        then add resolution.
+        Pixels of the sky, and of the PSFs, to one of the images along each axis. More than 1 is for
+        detectors with fewer than two pixels to the PSF's width, where offsets of fractions of a
+        pixel add resolution.
 
         The model of a pixel is the sum over its pixels of the sky. Positions and offsets stay in
         pixels of the images.
@@ -156,7 +156,8 @@ class Observation:
         (`lnocl.core.solvers.psf_errors`): blur along each axis, wings, shifts, single pixels, zero
         points of images. All of it is in the errors of stars, and what these show of it is taken
         into the PSFs of the reconstruction. By default 0.03, as real PSFs have
-        (:doc:`/validation/psf_priors`), or what PSFs of ``lnocl psf`` bring, less by several stars.
+        (:doc:`/validation/psf_priors`), or what PSFs of ``lnocl psf`` bring, less where these are
+        of several stars.
     star_psfs : array_like, shape (n, p, ky, kx), (p, ky, kx) or (ky, kx), optional
         PSFs of their own of the stars at `star_places`, such as one behind the mask of a
         coronagraph. All else has `psfs`: other stars, the extended source and what is tested. They
