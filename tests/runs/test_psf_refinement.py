@@ -446,7 +446,7 @@ class TestAScatterThatIsGiven:
         )
         assert beside.star_flux_errors[0] > 1.2 * without.star_flux_errors[0]
         weighted = lnocl.plan(beside._observation, [STAR], smoothing=0.1)
-        assert not weighted.judges_psfs
+        assert not weighted.does("judge PSFs before the run")
         np.testing.assert_array_equal(beside._observation.psf_scatter, [scatter])
 
 
