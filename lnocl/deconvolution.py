@@ -110,9 +110,9 @@ def deconvolve(
 
         So many are done unless `stop` or a callback ends the run sooner.
     stop : "held-out", "discrepancy", float or None, optional
-        When to stop before `n_iter`: "held-out", at the iteration that held-out counts choose;
-        "discrepancy", when the data are fitted as well as noise allows; a number below 1, when the
-        objective changes relatively by less in an iteration; or None.
+        When to stop before `n_iter`: "held-out", at the iteration that held-out counts choose
+        (cross-validation); "discrepancy", when the data are fitted as well as noise allows; a
+        number below 1, when the objective changes relatively by less in an iteration; or None.
 
         With "held-out" see Notes; where PSFs do not fit, which held-out counts do not notice, the
         run ends when the objective falls by less than 1e-6 of itself. With "discrepancy" it ends
@@ -160,19 +160,19 @@ def deconvolve(
         fixed (`lnocl.core.solvers.positions`). It runs at the start and after 3, 6, 12, 24 ...
         iterations. See Notes.
     refine_psfs : iterable of {"shift", "jitter", "strehl", "pupil", "modes", "pixels"}, or "auto"
-        What is fitted of PSFs to the stars before the reconstruction, where they do not fit: shift,
-        jitter (a blur, or a sharpening), strehl (needs `ideal_psfs` or `pupils`), pupil (phases;
-        needs `pupils`), modes (needs `psf_modes`), pixels. They are used where they fit better. By
-        default, where `smoothing` is "auto", these are jitter, of several images shift, those that
-        need what is given, and pixels. Where the `psf_error` of the observation is not 0, PSFs
-        first become what the stars show of them; jitter and pixels are then fitted only where PSFs
-        are off by more than twice that.
+        What is fitted of PSFs to the stars before the reconstruction, where they do not fit: shift;
+        jitter (a blur, or a sharpening); strehl (needs `ideal_psfs` or `pupils`); pupil (phases;
+        needs `pupils`); modes (needs `psf_modes`); pixels. Refined PSFs are used where they fit
+        better. By default, where `smoothing` is "auto": jitter, the shift of several images,
+        pixels, and those whose needs are given. Unless the `psf_error` of the observation is 0,
+        PSFs first become what the stars show of them. Then jitter and pixels are fitted only where
+        PSFs are off by more than twice that error.
 
         The extended source is marginalised. An empty sequence is for none, and leaves PSFs as they
         are given. See Notes. At least one star.
     mend_images : bool, optional
         Mask saturated cores of stars and cosmic rays, and fit relative exposures to stars, where
-        `smoothing` is "auto".
+        `smoothing` is "auto". By default this is done.
 
         Cores are flat at their top, 0, or wrapped round (`lnocl.core.scene.saturation`). Cosmic
         rays are sharper than the PSF (`lnocl.core.scene.blemishes`). Exposures of several images of
@@ -356,8 +356,8 @@ def deconvolve(
     References
     ----------
     A. La Camera, S. Antoniucci, M. Bertero et al., "Image reconstruction for observations with a
-    high dynamic range: LINC-NIRVANA simulations of a stellar jet", Proc. SPIE 8445 (2012), Eq. 7 to
-    9. S. Bonettini, R. Zanella, L. Zanni, "A scaled gradient projection method for constrained
+    high dynamic range: LINC-NIRVANA simulations of a stellar jet", Proc. SPIE 8445 (2012), Eq. 6 to
+    8. S. Bonettini, R. Zanella, L. Zanni, "A scaled gradient projection method for constrained
     image deblurring", Inverse Problems 25, 015002 (2009).
 
     Examples

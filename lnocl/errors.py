@@ -224,7 +224,15 @@ class LnoclWarning(UserWarning):
 
 
 class MisfitWarning(LnoclWarning):
-    """The model that a run has ended with does not fit its images; see `~lnocl.Result.verdict`.
+    """The model that a run has ended with does not fit its images.
+
+    `lnocl.deconvolve` and `lnocl.deconvolve_tiles` warn with one for each line of
+    `~lnocl.Result.verdict`, which says where the model does not fit and what to do.
+
+    Parameters
+    ----------
+    message : str
+        Text of the warning, a line of the verdict.
 
     Examples
     --------

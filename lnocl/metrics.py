@@ -12,9 +12,9 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike
 
-from lnocl.core.scene.arrays import Array, unmasked
+from lnocl.core.scene.arrays import Array, numbers
 from lnocl.core.scene.quantities import bare, in_unit, split
-from lnocl.errors import InputError
+from lnocl.errors import InputError, counted
 
 N_STAR_ROWS = 24
 
@@ -100,37 +100,38 @@ def restoration_error(
 
     .. math:: \rho = \| f - \bar f \| \, / \, \| \bar f \|
 
-    The paper's :math:`\rho'` is over all rows, its :math:`\rho''` over `star_rows`. For stars apart
-    from the extended source (MC-RL) compare the extended sources, without `star`. For both in one
-    image (RLM) give `star`. Its pixels are then masked in reconstruction and truth, so that the
-    truth may be given with the star or without it.
+    The norms are over the pixels compared. The paper's :math:`\rho'` is over all rows, its
+    :math:`\rho''` over `star_rows`. For stars apart from the extended source (MC-RL) compare the
+    extended sources, without `star`. For both in one image (RLM) give `star`. Its pixels are then
+    masked in reconstruction and truth, so that the truth may be given with the star or without it.
 
     Parameters
     ----------
     reconstruction : array_like, shape (ny, nx)
         The reconstructed source, f.
     truth : array_like, shape (ny, nx)
-        The true source, in the same unit.
+        The true source, in the same unit; a Quantity is converted.
     rows : slice, optional
         Rows to compare; by default all.
     star : (x, y), optional
-        Position of the star around which 3 x 3 pixels of both are set to 0.
+        Position of the star, a whole pixel, around which 3 x 3 pixels of both are set to 0.
 
     Returns
     -------
     float
-        Zero or more; 0.1 is an error of 10 %.
+        Zero or more; 0.1 is an error of 10 %. Infinite where it exceeds the range of numbers.
 
     Raises
     ------
     InputError
-        - The shapes differ, or a value is masked, not finite or too large to be squared.
-        - The box around the star leaves the image.
+        - The shapes differ, or a value is masked or not finite.
+        - `rows` is not a slice.
+        - The star is not at a whole pixel, or the box around it leaves the image.
         - The truth is zero in all pixels compared.
 
     References
     ----------
-    La Camera et al. (2012), Eq. 10.
+    La Camera et al. (2012), Eq. 9.
 
     Examples
     --------
@@ -146,14 +147,15 @@ def restoration_error(
     if star is not None:
         found, true = mask_star(found, star), mask_star(true, star)
     if rows is not None:
+        if not isinstance(rows, slice):
+            raise InputError(f"rows must be a slice, as star_rows returns; {rows} was given")
         found, true = found[rows], true[rows]
-    with np.errstate(over="ignore"):
-        deviation, norm = float(np.linalg.norm(found - true)), float(np.linalg.norm(true))
-    if not (math.isfinite(deviation) and math.isfinite(norm)):
-        raise InputError("the values are too large to be squared: divide both by a constant")
-    if norm == 0:
+    brightest = np.abs(true).max(initial=0.0)
+    if brightest == 0:
         raise InputError("the truth is zero in all pixels compared: no error is relative to it")
-    return deviation / norm
+    with np.errstate(over="ignore"):
+        found, true = found / brightest, true / brightest
+        return float(np.linalg.norm(found - true) / np.linalg.norm(true))
 
 
 def magnitude(flux: float, zero_magnitude_flux: float) -> float:
@@ -201,7 +203,8 @@ def flux_profile(image: ArrayLike, star: tuple[int, int] | None = None) -> Array
     image : array_like, shape (ny, nx)
         Source whose axis lies along y.
     star : (x, y), optional
-        Position of the star in the image of both (RLM); the 3 rows around it are masked.
+        Position of the star, a whole pixel, in the image of both (RLM). The 3 rows around it are
+        masked.
 
     Returns
     -------
@@ -211,7 +214,8 @@ def flux_profile(image: ArrayLike, star: tuple[int, int] | None = None) -> Array
     Raises
     ------
     InputError
-        The image is not a plane of finite, unmasked numbers, or a masked row lies outside it.
+        The image is not a plane of finite, unmasked numbers, or the star is not at a whole pixel,
+        one or more from its edge.
 
     References
     ----------
@@ -231,20 +235,19 @@ def flux_profile(image: ArrayLike, star: tuple[int, int] | None = None) -> Array
 
 
 def _plane(name: str, values: ArrayLike) -> Array:
-    array = unmasked(name, values)
-    if array.ndim != 2 or array.dtype.kind not in "biuf":
-        raise InputError(
-            f"{name} has {array.ndim} dimensions of {array.dtype}; give two, of real numbers"
-        )
+    array = numbers(name, values, copy=False)
+    if array.ndim != 2:
+        raise InputError(f"{name} has {counted(array.ndim, 'dimension')}; give two")
     if not np.isfinite(array).all():
         raise InputError(f"{name} holds values that are not finite")
-    return array.astype(np.float64, copy=False)
+    return array
 
 
 def _check_star(star: tuple[int, int], shape: tuple[int, ...]) -> tuple[int, int]:
-    x, y = in_unit("star", star, "pix")
-    if x != round(x) or y != round(y):
-        raise InputError(f"the star at ({x:g}, {y:g}) lies between pixels; give whole ones")
+    place = numbers("star", star, unit="pix")
+    if place.shape != (2,) or not np.array_equal(place, np.rint(place)):
+        raise InputError(f"star must be (x, y), in whole pixels; {star} was given")
+    x, y = place
     if not (0 <= x < shape[1] and 0 <= y < shape[0]):
         raise InputError(f"the star at ({x:g}, {y:g}) lies outside the image of shape {shape}")
     return round(x), round(y)

@@ -54,6 +54,12 @@ def test_restoration_error_has_no_unit(found, truth, scale):
     )
 
 
+def test_restoration_error_of_any_size():
+    for size in (1e308, 1e-200, 5e-324):
+        assert restoration_error([[-size, 0]], [[size, 0]]) == 2
+    assert restoration_error([[1e200]], [[1.0]]) == math.inf
+
+
 def test_star_rows_are_24_with_12_below():
     rows = star_rows((5, 12), (64, 10))
     assert (rows.start, rows.stop) == (0, 24)
@@ -99,7 +105,7 @@ def test_star_may_be_wherever_its_neighbours_are(star):
     [
         *((star, "outside") for star in [(-1, 2), (6, 2), (7, 2), (2, -1), (2, 4), (2, 5)]),
         *((star, "leave the image") for star in [(0, 2), (5, 2), (2, 0), (2, 3)]),
-        *((star, "between pixels") for star in [(1.5, 2), (1.4, 2), (2, 1.5), (2, 1.4)]),
+        *((star, "whole pixels") for star in [(1.5, 2), (1.4, 2), (2, 1.5), (2, 1.4)]),
     ],
 )
 def test_star_elsewhere_is_refused(star, message):
@@ -112,13 +118,16 @@ def test_star_elsewhere_is_refused(star, message):
     [
         (lambda: restoration_error(np.ones((2, 2)), np.ones((2, 3))), "shape"),
         (lambda: restoration_error(np.ones((2, 2)), np.zeros((2, 2))), "truth is zero"),
-        (lambda: restoration_error(np.ones(2), np.ones(2)), "1 dimensions"),
+        (lambda: restoration_error(np.ones(2), np.ones(2)), "1 dimension; give two"),
         (lambda: restoration_error([[math.nan]], [[1.0]]), "not finite"),
         (lambda: restoration_error([[1j]], [[1.0]]), "complex128"),
         (lambda: restoration_error(MASKED, np.ones((4, 4))), "reconstruction has 2 masked values"),
         (lambda: restoration_error(np.ones((4, 4)), MASKED), "truth has 2 masked values; fill"),
-        (lambda: restoration_error([[1e200]], [[1.0]]), "too large to be squared"),
-        (lambda: restoration_error([[-1e308]], [[1e308]]), "too large to be squared"),
+        (lambda: restoration_error(np.ones((4, 4)), np.ones((4, 4)), rows=(1, 2)), "a slice"),
+        (lambda: restoration_error(np.ones((4, 4)), np.ones((4, 4)), rows=2), "a slice"),
+        (lambda: mask_star(np.ones((4, 4)), (1, 2, 3)), r"star must be \(x, y\)"),
+        (lambda: mask_star(np.ones((4, 4)), (math.nan, 1)), r"star must be \(x, y\)"),
+        (lambda: mask_star(np.ones((4, 4)), "1,2"), "real numbers"),
         (lambda: mask_star(MASKED, (1, 1)), "image has 2 masked values; fill"),
         (lambda: flux_profile(MASKED), "image has 2 masked values; fill"),
         (lambda: star_rows((2, 11), (64, 48)), "do not fit in 64 rows"),

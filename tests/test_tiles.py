@@ -122,6 +122,8 @@ def test_models_of_photutils_are_sampled_on_the_pixels_of_the_sky(side, oversamp
     if oversample > 1:
         with pytest.raises(InputError, match="give effective_psfs=True"):
             lnocl.Observation(np.ones((51, 41)), model, oversample=2)
+    with pytest.raises(InputError, match="oversample must be a whole number, 1 or more"):
+        PsfField.of_model(model, 0)
 
 
 def test_fields_must_serve_all_images():

@@ -229,5 +229,8 @@ def _device_spec(arguments: argparse.Namespace) -> str | None:
 
 
 COMMAND = Command(
-    "reconstruct the sky from images of it, as stars plus an extended source", OPTIONS, _run
+    "reconstruct the sky from images of it, as stars plus an extended source",
+    OPTIONS,
+    _run,
+    "Example: lnocl deconvolve image.fits --psf psf.fits --background auto --star 60,32 -o a.fits",
 )

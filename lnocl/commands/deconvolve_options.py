@@ -47,7 +47,7 @@ OPTIONS = {
             action="store_true",
             help="add cubes: RESIDUALS of each image, (image - model) / sqrt(model), and MODELS, "
             "in electrons, whose headers have the coordinates of the image where all images share "
-            "them, else their offsets; and ELECTRONS, those in one unit of the result",
+            "them, else their offsets; and ELECTRONS, how many one unit of the result is",
         ),
         options.PICTURE.but(
             help="picture of image, model, residuals and extended source, whole and at each star, "
@@ -58,8 +58,8 @@ OPTIONS = {
     ],
     "calibration": [
         BACKGROUND.but(
-            help=f"{BACKGROUND.keywords['help']}; it is taken as known, where the amount of "
-            "`halos` is fitted"
+            help=f"{BACKGROUND.keywords['help']}; a number or a map is taken as known, while the "
+            "amount of `halos` is fitted"
         ),
         parameter(
             Calibration,
@@ -110,7 +110,7 @@ OPTIONS = {
         parameter(
             deconvolve,
             "refine_psfs",
-            also="none is for no fit",
+            also="none: no fit",
             default=None,
             nargs="+",
             choices=(*FAMILIES, "none"),
@@ -164,8 +164,8 @@ OPTIONS = {
             type=int,
             metavar="N",
             help="reconstruct tile by tile on grids of N x N pixels, each with the PSF of its "
-            "middle: for large images, and PSFs that vary (default: where --psf is a grid of PSFs "
-            "five times its side, else the whole)",
+            "middle: for large images, and PSFs that vary (default: about five times the side of "
+            "the PSFs where --psf is a grid of them, else no tiles)",
         ),
         options.parallel("tiles"),
     ],

@@ -149,5 +149,5 @@ COMMAND = Command(
     "find sources beside the stars of a result, at a stated rate of false alarms",
     {"": OPTIONS},
     _run,
-    "A detection is called a point, or something that the extended source could be.",
+    "The kind of a detection is point, or extended where the extended source could be it.",
 )

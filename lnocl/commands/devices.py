@@ -47,7 +47,7 @@ def _tune(spec: str | None) -> Iterator[str]:
 
 
 COMMAND = Command(
-    "list the OpenCL devices, say which one is used and why, and measure what is fastest on it",
+    "list the OpenCL devices, and say which is used and why; or tune one of them",
     {
         "": [
             options.option(

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 # Names of quantities of stars and halos; others are of regions and profiles.
 _OF_STARS = re.compile(r"star \d+( epoch \d+)? (flux|x|y)|halo \d+ image \d+")
 OPTIONS = [
-    options.result("its errors are added to it, after those of replicas that it has"),
+    options.result("errors are added to it; replicas that it has already count"),
     parameter(Result.bootstrap, "n", "--bootstrap"),
     option(
         "--regions",

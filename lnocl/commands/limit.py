@@ -36,8 +36,8 @@ OPTIONS = [
         type=int,
         default=100,
         metavar="N",
-        help="sources that are put into the images to check the limits, half of them at that of "
-        "50 %%, half at that of 90 %%; 0 for none (default: %(default)s)",
+        help="sources that are put into the images to check the limits: half of the flux that is "
+        "found with 50 %% probability, half with 90 %%; 0 for none (default: %(default)s)",
     ),
     option(
         "--seed",
@@ -45,7 +45,7 @@ OPTIONS = [
         default=0,
         metavar="S",
         needs=("injections",),
-        help="of these sources, 0 or more (default: %(default)s)",
+        help="seed of these sources, 0 or more (default: %(default)s)",
     ),
     options.table_output("curves too", metavar="TABLE.ecsv"),
     options.PICTURE.but(help="picture of the map of the limits and of their curves"),

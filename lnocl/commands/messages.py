@@ -63,7 +63,7 @@ def in_shell(message: str, flags: Mapping[str, str]) -> str:
     """
     typed = with_names(message, lambda name: flags.get(name, name), first=1)
     typed = re.sub(r"--([\w-]+) False\b", r"--no-\1", typed)
-    return re.sub(r"(--[\w-]+)=", r"\1 ", typed)
+    return re.sub(r"(--[\w-]+)=(True\b)?", lambda found: found[1] + " " * (not found[2]), typed)
 
 
 def show_warning(flags: Mapping[str, str], message: Warning | str, *_: object) -> None:

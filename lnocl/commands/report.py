@@ -15,7 +15,7 @@ OPTIONS = [
         "result",
         metavar="RESULT",
         is_input=True,
-        help="FITS file that lnocl deconvolve has written, with --residuals",
+        help="FITS file that lnocl deconvolve has written, with --residuals for all pictures",
     ),
     option("-o", "--output", required=True, metavar="REPORT.html", help="page to write"),
     options.OVERWRITE.but(help="replace REPORT.html if it exists"),

@@ -67,8 +67,8 @@ def make_parser(commands: Mapping[str, Command]) -> Parser:
     parser = Parser(
         prog="lnocl",
         description="Multi-component Richardson-Lucy deconvolution of astronomical images.",
-        epilog="Exit status: 0 done, 1 failed, 2 wrong use, 130 interrupted, 129 or 143 "
-        "terminated.",
+        epilog="Try lnocl demo first. lnocl COMMAND --help has the options of a command. Exit "
+        "status: 0 done, 1 failed, 2 wrong use, 130 interrupted, 129 or 143 terminated.",
     )
     parser.add_argument("--version", action="version", version=f"lnocl {__version__}")
     subparsers = parser.add_subparsers(

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy import ndimage
 
-from lnocl.core.scene.arrays import Array, Mask, darker_noise
+from lnocl.core.scene.arrays import Array, Mask, darker_noise, number_in
 from lnocl.core.scene.blemishes import sharp_pixels
 from lnocl.core.scene.cores import core, fwhm
 from lnocl.core.scene.quantities import in_unit, split
@@ -63,8 +63,8 @@ def find_stars(
     r"""Return the stars in an image, by a matched filter with its PSF.
 
     The sky's level is a sigma-clipped median in boxes, interpolated between them, and the noise is
-    that of neighbouring pixels. At each pixel n the filter fits a flux c of the PSF P and a
-    constant b to the image g without its level, in a disc round it,
+    that of neighbouring pixels. The filter works on the image g without its level. At each pixel n
+    it fits a flux c of the PSF P and a constant b, in a disc round it,
 
     .. math:: \min_{c, b} \sum_m w_m (g_m - c P_{n m} - b)^2
 
@@ -88,17 +88,17 @@ def find_stars(
         Its PSF, with its peak at (ky // 2, kx // 2). Without it, it is a round Moffat function as
         wide as the image's own stars.
     threshold : float, optional
-        Smallest significance of a star; more than 0.
+        Smallest significance of a star, standard deviations; more than 0.
     mask : array_like of bool, shape (ny, nx), optional
         True where a pixel is bad.
     saturation : float, optional
-        Pixels of this value and above are saturated, besides flat tops. A Quantity has the unit of
-        the image's.
+        Pixels of this value and above are saturated, besides flat tops; more than 0. A Quantity is
+        converted to the unit of the image.
 
     Returns
     -------
     astropy.table.Table
-        A row for each star, the brightest first, with these columns:
+        A row for each star, the saturated ones first, and then the brightest, with these columns:
 
         - ``x`` and ``y``: pixels, 0-based;
         - ``peak``: of its image above the sky, in the unit of the image;
@@ -118,8 +118,8 @@ def find_stars(
     Raises
     ------
     InputError
-        An array has another shape or type, the threshold is not more than 0, or the image has no
-        good pixel.
+        - An array has another shape or type, or the image has no good pixel.
+        - The threshold or the saturation is not a number of more than 0.
     LnoclError
         photutils is not installed.
 
@@ -147,8 +147,8 @@ def find_stars(
     threshold = in_unit("threshold", threshold, "")
     if saturation is not None:
         saturation = in_unit("saturation", saturation, unit or "")
-    if not threshold > 0:
-        raise InputError(f"`threshold` must be more than 0; {threshold:g} was given")
+        number_in("saturation", saturation, "more than 0", lambda given: given > 0)
+    number_in("threshold", threshold, "more than 0", lambda given: given > 0)
     pixels, bad = read_image("image", image, mask)
     bad |= _outside(pixels)
     if bad.all():

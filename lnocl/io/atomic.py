@@ -442,7 +442,7 @@ def _check_replaceable(path: str, overwrite: bool) -> None:
         raise FileError(f"the output {path} exists and is not a regular file; give another name")
     if not overwrite:
         raise FileError(
-            f"the output {path} exists; give another name, or --overwrite to replace it"
+            f"the output {path} exists; give another name, or `overwrite`=True to replace it"
         )
 
 

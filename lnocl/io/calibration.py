@@ -40,8 +40,8 @@ class Calibration(NamedTuple):
     mask : sequence of str
         FITS file that is not 0 where a pixel is bad; or dq, the extension DQ of each image, or wht,
         where its extension WHT is 0; one for all images or one for each. dq:BITS names the flags
-        that are no fault, as in dq:16,64, or dq:~1 for all but 1; dq:0 for none (default: of JWST
-        ~1,512, of HST those of pixels that were corrected, else 0).
+        that are no fault, as in dq:16,64, or dq:~1 for all but 1; with dq:0 each flag is a fault
+        (default: of JWST ~1,512, of HST those of pixels that were corrected, else 0).
 
         Flags are as for `flags.bad_pixels`.
     saturation : float, optional
@@ -64,11 +64,11 @@ class Calibration(NamedTuple):
         keyword of their headers such as PARANG, a file (FITS, or text with a number a line), or one
         number for each image. The extended source has north up.
     centre : tuple of float, optional
-        With `angle`: where the field turns about, pixels (default: the middle, nx // 2, ny // 2).
+        Pixel about which the field turns, with `angle` (default: the middle, nx // 2, ny // 2).
     epoch : sequence of float or str
-        Epochs of the images, in each of which a star has a flux of its own, as a quasar that
-        varies: each, for one an image; a keyword of their headers such as DATE-OBS; or a label for
-        each image (default: one epoch).
+        Epochs of the images; stars, such as a quasar that varies, have a flux of their own in each.
+        Give the word each, where every image is an epoch; a keyword of their headers such as
+        DATE-OBS; or a label for each image (default: one epoch).
     oversample, effective_psfs, psf_centre, psf_error
         As for `Observation`.
     psf_errors : sequence of str

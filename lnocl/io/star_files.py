@@ -62,7 +62,7 @@ def read_stars(path: str, header: fits.Header, image: str) -> Array:
     LnoclWarning
         Stars that lie outside the image, and are left out.
     """
-    table = _read_table(path)
+    table = star_tables.once_each(_read_table(path))
     columns = star_tables.find_columns(table.colnames, star_tables.IN_PIXELS)
     of_sky, sky_columns = _coordinates(path, table)
     if of_sky is not None:

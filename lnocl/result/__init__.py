@@ -222,10 +222,11 @@ class Result(Measured):
         -------
         astropy.table.QTable
             Columns ``x`` and ``y`` in pixels, 0-based, and ``flux`` and ``flux_error`` in
-            electrons, per second where exposures were given. Where positions were refined, also
-            ``x_error`` and ``y_error``. With several epochs each star has a row in each, and
-            ``epoch`` is its number, ``epoch_label`` its label, and ``variation_error`` the error
-            of the flux less the star's mean: rows of one star are its light curve.
+            electrons, per second where exposures were given. A flux is NaN where no good pixel
+            shows the star. Where positions were refined, also ``x_error`` and ``y_error``, in
+            pixels. With several epochs each star has a row in each: rows of one star are its light
+            curve. Then ``epoch`` is the number of the epoch, from 0 on, and ``epoch_label`` its
+            label; ``variation_error`` is the error of the flux less the star's mean.
 
         Examples
         --------
@@ -296,16 +297,19 @@ class Result(Measured):
         """Write a FITS file, which ``lnocl plot`` and ``lnocl report`` read.
 
         It is the file of ``lnocl deconvolve --residuals``, without the options, the command, and
-        what was measured and chosen, and without ESTIMATE, which needs a command that leads to the
-        images. The primary HDU holds the extended source. The tables STARS, HALOS, HISTORY,
-        HELDOUT and PLAN hold the stars, the amounts of halos, the objectives, the errors that
-        held-out counts estimate, and the plan. The cubes MODELS and RESIDUALS hold those of each
-        image, ELECTRONS how many electrons of it are in the unit of the file. PSFS and others are
-        added where PSFs were refined. Units are electrons, per second where exposures were given.
+        what was measured and chosen. It has no ESTIMATE, which needs a command that leads to the
+        images. The primary HDU holds the extended source. The tables STARS, HISTORY, PLAN and
+        MESSAGES hold the stars, the objectives, the plan, and the lines of ``print(result)``.
+        HALOS holds the amounts of halos, and HELDOUT the errors that held-out counts estimate,
+        where there are any. PSFS and others are added where PSFs were refined. Extended source and
+        stars are in electrons, per second where exposures were given.
+
+        The cubes MODELS and RESIDUALS hold `models`, in electrons, and `residuals` of each image.
+        ELECTRONS holds how many electrons of each image one unit of the extended source is.
 
         Parameters
         ----------
-        path : str
+        path : str or path
             File to write, named .fits, .fit or .fts.
         header : astropy.io.fits.Header, optional
             Header of the first image, or of another whose pixels are those of the sky. The

@@ -58,6 +58,6 @@ def check_shape(shape: Any, minimum: int = MIN_SIZE) -> tuple[int, int]:
     for n in (ny, nx):
         if not isinstance(n, (int, np.integer)) or n % 2 or n < minimum:
             raise InputError(
-                f"the image is {nx} x {ny} pixels; each side must be even and {minimum} or more"
+                f"the image is {nx} x {ny} pixels; sides must be whole, even and {minimum} or more"
             )
     return int(ny), int(nx)

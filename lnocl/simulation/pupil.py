@@ -10,7 +10,7 @@ from astropy import units as u
 
 from lnocl.core.scene.arrays import Array
 from lnocl.errors import InputError
-from lnocl.simulation.checks import check_shape, number, positive
+from lnocl.simulation.checks import check_shape, number, numbers, positive
 from lnocl.simulation.telescope import APERTURE_DIAMETER, BASELINE, OBSCURATION_DIAMETER
 
 # A pixel that an edge cuts is open by the share of its points inside, so many along an axis.
@@ -44,18 +44,21 @@ def circular_pupil(
         Diameter of each aperture, a length, positive.
     obscuration : Quantity, optional
         Diameter of the central obscuration of each aperture, zero or more and less than `diameter`.
-    centres : sequence of Quantity, each of shape (2,), optional
-        (x, y) of the apertures, lengths; by default one in the middle.
+    centres : Quantity, shape (n, 2), or sequence of Quantity, optional
+        (x, y) of the apertures, lengths; by default one in the middle. Where apertures overlap the
+        pupil is open.
 
     Returns
     -------
     ndarray of float64, shape (ny, nx)
-        Transmission, 0 to 1; the middle of the pupil is at ``(ny // 2, nx // 2)``.
+        Transmission, 0 to 1: the share of each pixel that is open. The middle of the pupil is at
+        ``(ny // 2, nx // 2)``.
 
     Raises
     ------
     InputError
-        An argument has the wrong unit or is out of range, or an aperture lies beyond the frame.
+        - An argument has the wrong shape or unit, or is out of range.
+        - An aperture reaches beyond the frame, or all are too small for its pixels.
 
     References
     ----------
@@ -77,15 +80,19 @@ def circular_pupil(
     if inner >= outer:
         raise InputError(f"obscuration must be less than diameter; {obscuration} was given")
     y, x = (length / scale * _points(n) for n in (ny, nx))
-    pupil = np.zeros((ny * POINTS, nx * POINTS))
-    for centre in centres:
-        at_x, at_y = (number("centres", value, u.m) for value in centre)
+    pupil = np.zeros((ny * POINTS, nx * POINTS), bool)
+    places = numbers("centres", centres, u.m)
+    if places.shape[1:] != (2,):
+        raise InputError(f"centres must be (x, y) of each aperture, (n, 2); {centres} was given")
+    for at_x, at_y in places:
         if abs(at_x) + outer > x[-1] or abs(at_y) + outer > y[-1]:
             raise InputError(
                 f"an aperture reaches beyond the frame of {2 * x[-1]:.3g} m: give finer pixels"
             )
         r = np.hypot(y[:, None] - at_y, x - at_x)
-        pupil += (r <= outer) & (r >= inner)
+        pupil |= (r <= outer) & (r >= inner)
+    if not pupil.any():
+        raise InputError("no pixel of the pupil is open: give more of the centres or a diameter")
     return pupil.reshape(ny, POINTS, nx, POINTS).mean(axis=(1, 3))
 
 

@@ -12,7 +12,7 @@ from astropy import units as u
 from numpy.typing import ArrayLike
 from scipy.special import expit
 
-from lnocl.core.scene.arrays import unmasked
+from lnocl.core.scene.arrays import numbers
 from lnocl.core.scene.quantities import bare
 from lnocl.errors import InputError
 from lnocl.io import fitsread
@@ -84,14 +84,8 @@ class Target:
     """
 
     def __init__(self, extended: ArrayLike, stars: Sequence[Star] = ()) -> None:
-        array = unmasked("the extended source", bare("the extended source", extended))
-        if array.ndim != 2 or array.dtype.kind not in "biuf":
-            raise InputError(
-                f"the extended source has {array.ndim} dimensions of {array.dtype}; "
-                "give two, of real numbers"
-            )
+        array = numbers("the extended source", bare("the extended source", extended))
         check_shape(array.shape)
-        array = array.astype(np.float64)
         if not (np.isfinite(array).all() and (array >= 0).all()):
             raise InputError("the extended source must be finite and not negative everywhere")
         with np.errstate(over="ignore"):
@@ -110,10 +104,10 @@ def hh34(size: int = DEFAULT_SIZE) -> Target:
     """Return a jet of the kind of HH 34 and the star that drives it, on a square of this size.
 
     The axis of the jet lies along y. It leaves the star as a thin spine that widens and wiggles a
-    little, carries curved knots, and ends in a bow shock. The first knot is 8 pixels from the star,
-    and each is 1.45 times as far as the one before. Width and knots are the same in a frame of any
-    size. The length follows the frame, so a jet in a smaller one is cut shorter and has fewer
-    knots. Nothing in it is random.
+    little and carries curved knots. It ends in a bow shock, ``0.62 * size`` pixels from the star.
+    The first knot is 8 pixels from the star, and each is 1.45 times as far as the one before. Width
+    of the spine and places of the knots are the same in a frame of any size. In a smaller one the
+    jet is shorter, has fewer knots and fades faster. Nothing in it is random.
 
     Parameters
     ----------
@@ -123,12 +117,12 @@ def hh34(size: int = DEFAULT_SIZE) -> Target:
     Returns
     -------
     Target
-        With the star, of magnitude 13, at ``(size // 2, size // 4)``.
+        The jet, of unit sum, and the star, of magnitude 13, at ``(size // 2, size // 4)``.
 
     Raises
     ------
     InputError
-        The size is odd or too small.
+        The size is not a whole number, odd or below 64.
 
     Examples
     --------

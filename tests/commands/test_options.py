@@ -38,6 +38,9 @@ def test_messages_name_the_flag_that_does_it_and_not_the_one_that_undoes_it():
     flags = deconvolve.COMMAND.flags()
     named = messages.in_shell("give its place, take `refine_positions`, or mend it", flags)
     assert named == "give its place, take --refine, or mend it"
+    assert messages.in_shell("give `effective_psfs`=True, and `pad`=8", flags) == (
+        "give --effective-psfs, and --pad 8"
+    )
     assert messages.in_shell("(`mend_images` False leaves them)", flags) == (
         "(--no-mend-images leaves them)"
     )

@@ -257,8 +257,11 @@ class TestSaturated:
     [
         (np.ones((2, 9, 9)), {}, r"image has shape \(2, 9, 9\); give one image"),
         (np.full((9, 9), np.nan), {}, "image has no good pixel"),
-        (np.ones((9, 9)), {"threshold": 0.0}, "threshold must be more than 0; 0 was given"),
+        (np.ones((9, 9)), {"threshold": 0.0}, "threshold must be more than 0; 0.0 was given"),
         (np.ones((9, 9)), {"threshold": np.nan}, "threshold must be more than 0; nan was given"),
+        (np.ones((9, 9)), {"threshold": "5"}, "threshold must be more than 0; 5 was given"),
+        (np.ones((9, 9)), {"saturation": np.nan}, "saturation must be more than 0; nan was given"),
+        (np.ones((9, 9)), {"saturation": -5.0}, "saturation must be more than 0; -5.0 was given"),
         (
             np.ones((9, 9)),
             {"mask": np.zeros((9, 8), bool)},

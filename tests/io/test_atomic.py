@@ -264,7 +264,7 @@ class TestCheckOutput:
     @pytest.mark.parametrize(
         ("name", "error", "message"),
         [
-            ("there.fits", FileError, "exists; give another name, or --overwrite"),
+            ("there.fits", FileError, "exists; give another name, or overwrite=True to"),
             ("missing/out.fits", FileError, "does not exist; create it first"),
             ("there.fits/out.fits", FileError, "cannot be written: Not a directory"),
             ("folder", FileError, "is not a regular file"),

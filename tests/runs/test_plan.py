@@ -80,6 +80,11 @@ def test_steps_of_a_scene_and_the_reasons_against_others(name):
     assert all(str(plan).count(f"{step}: no, ") == (step not in expected) for step in STEPS)
 
 
+def test_a_step_of_another_name_is_refused():
+    with pytest.raises(lnocl.InputError, match="no step is called 'judge'; choose from align"):
+        lnocl.plan(observe()).does("judge")
+
+
 @pytest.mark.exhaustive
 @pytest.mark.parametrize("name", SCENES)
 @pytest.mark.filterwarnings("ignore::lnocl.LnoclWarning")
@@ -113,7 +118,7 @@ def test_a_run_takes_the_steps_of_its_plan(name, monkeypatch):
 
 def test_families_that_are_named_are_judged_whatever_the_smoothing():
     plan = lnocl.plan(observe(), STAR, smoothing=0.1, refine_psfs=["jitter"])
-    assert plan.judges_psfs
+    assert plan.does("judge PSFs before the run")
     assert plan.families == ("jitter",)
     assert f"{PSFS}: yes, and fit jitter" in str(plan)
     assert plan.why_not(STARS) == "`smoothing` is a number"

@@ -423,7 +423,7 @@ class TestAScatterThatIsGiven:
 
     def test_without_a_star_nothing_is_judged_by_it(self):
         observation = lnocl.Observation(images_through([PSF]), PSF, psf_scatter=PSF)
-        assert not lnocl.plan(observation).judges_psfs
+        assert not lnocl.plan(observation).does("judge PSFs before the run")
 
     @pytest.mark.exhaustive
     def test_psfs_that_may_have_an_error_are_as_right_as_without_it(self):
@@ -446,7 +446,7 @@ class TestAScatterThatIsGiven:
         )
         assert beside.star_flux_errors[0] > 1.2 * without.star_flux_errors[0]
         weighted = lnocl.plan(beside._observation, [STAR], smoothing=0.1)
-        assert not weighted.judges_psfs
+        assert not weighted.does("judge PSFs before the run")
         np.testing.assert_array_equal(beside._observation.psf_scatter, [scatter])
 
 

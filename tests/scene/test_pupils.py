@@ -84,11 +84,20 @@ def test_a_circular_pupil_has_its_area_and_place():
     assert (pupil * Y).sum() / pupil.sum() * pixel == pytest.approx(1.5, abs=0.02)
 
 
+def test_apertures_that_overlap_are_open_once():
+    pupil = circular_pupil((N, N), 1 * u.um, 10 * u.mas, 6 * u.m, centres=np.zeros((2, 2)) * u.m)
+    np.testing.assert_array_equal(pupil, circular_pupil((N, N), 1 * u.um, 10 * u.mas, 6 * u.m))
+
+
 REFUSED = [
     ({"obscuration": 8 * u.m}, "obscuration must be less than diameter"),
     ({"diameter": 30 * u.m}, "an aperture reaches beyond the frame of 20.3 m"),
     ({"diameter": 8 * u.s}, "diameter must be a quantity in m"),
     ({"shape": (7, 8)}, "the image is 8 x 7 pixels"),
+    ({"centres": [0, 0] * u.m}, r"centres must be \(x, y\) of each aperture"),
+    ({"centres": [[0, 0, 0]] * u.m}, r"centres must be \(x, y\) of each aperture"),
+    ({"centres": np.zeros((0, 2)) * u.m}, "no pixel of the pupil is open"),
+    ({"diameter": 1 * u.mm}, "no pixel of the pupil is open"),
 ]
 
 

@@ -322,7 +322,7 @@ def test_a_place_without_a_star_is_refused():
 def test_psfs_are_not_judged_by_a_star_that_has_its_own():
     with pytest.raises(lnocl.InputError, match="refine_psfs needs a star"):
         lnocl.deconvolve(observe(), [STAR], engine="numpy", refine_psfs=["jitter"])
-    assert not lnocl.plan(observe(psf_scatter=0.1 * PSFS), [STAR]).judges_psfs
+    assert not lnocl.plan(observe(psf_scatter=0.1 * PSFS), [STAR]).does("judge PSFs before the run")
     alone, both = lnocl.plan(observe(), [STAR]), lnocl.plan(observe(), [STAR, PLANET])
     assert alone.why_not("judge PSFs before the run") == "all stars have PSFs of their own"
     assert alone.does("take marginal star fluxes")

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from astropy import units as u
 from astropy.table import QTable, Table
+from scenes import paper
 
 import lnocl
 from lnocl.core.scene.star_tables import IN_PIXELS, ON_SKY, find_columns
@@ -19,8 +20,9 @@ POSITIONS = [(5.5, 7.0), (9.0, 3.0)]
         Table(np.array(POSITIONS), names=["xcentroid", "ycentroid"]),
         Table(np.add(POSITIONS, 1), names=["X_IMAGE", "Y_IMAGE"]),
         QTable({"y": [7.0, 3.0] * u.pix, "x": [5.5, 9.0] * u.pix, "id": ["a", "b"]}),
+        Table({"x": [5.5, 9.0], "y": [7.0, 3.0], "epoch": [2016.0, 2016.0]}),
     ],
-    ids=["photutils", "SExtractor", "quantities"],
+    ids=["photutils", "SExtractor", "quantities", "a date"],
 )
 def test_stars_may_be_a_table(table):
     np.testing.assert_array_equal(check_positions(table, OBSERVATION), POSITIONS)
@@ -43,6 +45,13 @@ def test_tables_that_hold_no_stars(table, message):
     with pytest.raises(lnocl.InputError) as caught:
         check_positions(table, OBSERVATION)
     assert str(caught.value).startswith(message)
+
+
+def test_the_table_of_a_result_with_epochs_has_each_star_once():
+    given = lnocl.Observation(np.ones((3, 16, 16)), np.eye(1), epochs=["b", "a", "b"])
+    result = paper(given, POSITIONS, n_iter=1, engine="numpy")
+    assert len(result.to_table()) == 4
+    np.testing.assert_array_equal(check_positions(result.to_table(), given), POSITIONS)
 
 
 def test_no_rows_are_no_stars():

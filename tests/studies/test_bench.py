@@ -217,7 +217,7 @@ class TestCommand:
             ([*FILES, "--accuracy", "0"], "accuracy must be positive and finite; 0"),
             ([*FILES, "--accuracy", "nan"], "accuracy must be positive and finite; nan"),
             ([*FILES, "--device", "no such"], "fits no OpenCL device"),
-            (["--size", "65"], "each side must be even"),
+            (["--size", "65"], "sides must be whole, even"),
         ],
     )
     def test_wrong_use_is_one_line(self, arguments, message, capsys):

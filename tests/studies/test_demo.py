@@ -108,7 +108,7 @@ class TestDemo:
     @pytest.mark.parametrize(
         ("arguments", "status", "message"),
         [
-            (["--size", "65"], 2, "each side must be even"),
+            (["--size", "65"], 2, "sides must be whole, even"),
             (["--device", "no such"], 2, "fits no OpenCL device"),
             (["-o", "full"], 1, "the output folder full is not empty"),
         ],

@@ -27,6 +27,7 @@ from lnocl.core.scene.star_psfs import owned, refuse_unowned
 from lnocl.core.scene.stars import check_positions
 from lnocl.core.scene.zero_points import FEWEST
 from lnocl.core.solvers import SolverName
+from lnocl.errors import InputError
 
 PLACES, CORES, RAYS, EXPOSURES, LEVELS, PSFS, HALOS, PRIOR, CHOICE, STARS = STEPS = (
     "align images by their stars",
@@ -165,20 +166,43 @@ class Plan:
     mends: bool = True
     found: Mapping[str, str] = field(default_factory=dict)
 
-    @property
-    def judges_psfs(self) -> bool:
-        """Whether PSFs are judged before the run, of itself or as it was asked for."""
+    def why_not(self, step: str) -> str:
+        """Return why a step is not done; an empty text where it is.
+
+        Parameters
+        ----------
+        step : str
+            A step as `steps` names it, such as "mask cosmic rays".
+
+        Returns
+        -------
+        str
+            The first reason, such as "there are no stars".
+
+        Raises
+        ------
+        InputError
+            There is no such step.
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> import lnocl
+        >>> plan = lnocl.plan(lnocl.Observation(np.full((16, 16), 9.0), np.ones((3, 3))))
+        >>> plan.why_not("mask saturated cores"), plan.why_not("mask cosmic rays")
+        ('there are no stars', '')
+        """
+        if step not in NEEDS:
+            raise InputError(f"no step is called {step!r}; choose from {', '.join(STEPS)}")
         observation = self.setup.observation
         # Else it is one of the unknowns at the stars.
         is_given = len(observation.psf_scatter) > 0 and not observation.psf_error
-        return self.does(PSFS) or bool(self.families) or (is_given and SHOWS_PSFS.holds(self))
-
-    def why_not(self, step: str) -> str:
-        """Return why a step of `STEPS` is not done; nothing where it is."""
+        if step == PSFS and (self.families or (is_given and SHOWS_PSFS.holds(self))):
+            return ""
         return next((each.otherwise for each in NEEDS[step] if not each.holds(self)), "")
 
     def does(self, step: str) -> bool:
-        """Return whether a step of `STEPS` is done."""
+        """Return whether a step is done, as `steps` names it; see `why_not`."""
         return not self.why_not(step)
 
     def steps(self) -> list[tuple[str, str]]:
@@ -186,12 +210,12 @@ class Plan:
         return [(step, self._in_words(step)) for step in STEPS]
 
     def _in_words(self, step: str) -> str:
-        if step == PSFS and self.judges_psfs:
-            return f"yes, and fit {', '.join(self.families)}" if self.families else "yes"
         if why := self.why_not(step):
             return f"no, {why}"
+        if step == PSFS and self.families:
+            return f"yes, and fit {', '.join(self.families)}"
         where = WHERE.get(step, "")
-        if where == UNLESS_WRONG and not self.does(PSFS):
+        if where == UNLESS_WRONG and not (AUTO.holds(self) and self.does(PSFS)):
             where = ""
         return ", ".join(filter(None, ("yes", where, self.found.get(step, ""))))
 
@@ -254,7 +278,6 @@ def plan(
     check_observation(observation)
     check_choices(solver, precision, engine, device)
     check_length(n_iter, stop)
-    mends = flag("mend_images", mend_images)
     refine_positions = read_refine_positions(refine_positions)
     fits_stars = solver == "sgp" or refine_positions is True
     positions = check_positions(stars, observation)
@@ -264,8 +287,8 @@ def plan(
     smoothing = read_smoothing(smoothing)
     Penalty(mu, 0.0 if isinstance(smoothing, str) else smoothing)  # refuses what is out of range
     setup = Setup(observation, positions, pad, solver, precision, engine, device, False, *initial)
-    made = Plan(setup, mu, smoothing, int(n_iter), stop, mends=mends)
-    is_auto = made.does(PSFS)
+    made = Plan(setup, mu, smoothing, int(n_iter), stop, mends=flag("mend_images", mend_images))
+    is_auto = AUTO.holds(made) and made.does(PSFS)
     showing = positions[owned(observation, positions) < 0]
     families = check_families(refine_psfs, observation, showing, refine_positions, is_auto)
     moves = refine_positions if is_auto else refine_positions is True

@@ -11,7 +11,7 @@ import numpy as np
 
 from lnocl.core.runs.options import StopName
 from lnocl.core.runs.outcome import Mended, PsfRefinement
-from lnocl.core.runs.plan import CORES, EXPOSURES, LEVELS, PLACES, PSFS, RAYS, Plan
+from lnocl.core.runs.plan import AUTO, CORES, EXPOSURES, LEVELS, PLACES, PSFS, RAYS, Plan
 from lnocl.core.runs.start import Setup
 from lnocl.core.runs.steady import STEADY, steady_penalty
 from lnocl.core.scene.arrays import Array
@@ -84,8 +84,8 @@ def prepare(plan: Plan, progress: bool = False) -> Prepared:
 
         with quietly(), Progress(None, "", bool(progress), "fitting levels"):
             setup = settle_levels(setup)
-    mended = _judge_psfs(plan, setup, progress) if plan.judges_psfs else Mended(setup)
-    is_auto, stop = plan.does(PSFS), plan.stop
+    mended = _judge_psfs(plan, setup, progress) if plan.does(PSFS) else Mended(setup)
+    is_auto, stop = AUTO.holds(plan) and plan.does(PSFS), plan.stop
     are_wrong = is_auto and mended.near_stars is not None and not mended.fits
     penalties = _penalties(plan, mended, are_wrong)
     if are_wrong and stop == "held-out":  # which shares their error, and chooses too little

@@ -30,13 +30,14 @@ class Quantity(NamedTuple):
     name : str
         Its name, such as "star 1 flux".
     kind : str
-        "flux", in electrons, "length", in pixels, or "halo", in electrons of one image.
+        "flux", in electrons, per second where exposures were given; "halo", in electrons of one
+        image; "length", a position or a width, in pixels.
     value : float
         Its value in the reconstruction.
     note : str
         Why its error may not hold; else empty.
     at : float or None
-        Position along a profile, pixels.
+        Position along a profile, pixels from its middle; None elsewhere.
 
     Examples
     --------

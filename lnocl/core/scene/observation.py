@@ -119,9 +119,9 @@ class Observation:
         The epoch of each image, such as its night: numbers or text. Stars have a flux in each
         epoch, the rest of the sky is common. By default all images are of one epoch.
     oversample : {1, 2, 4}, optional
-        Pixels of the sky, and of the PSFs, to one of the images along each axis, for detectors with
-        fewer than two pixels to the PSF's width. Offsets of fractions of a pixel then add
-        resolution.
+        Pixels of the sky, and of the PSFs, to one of the images along each axis. More than 1 is for
+        detectors with fewer than two pixels to the PSF's width, where offsets of fractions of a
+        pixel add resolution.
 
         The model of a pixel is the sum over its pixels of the sky. Positions and offsets stay in
         pixels of the images.
@@ -156,7 +156,8 @@ class Observation:
         (`lnocl.core.solvers.psf_errors`): blur along each axis, wings, shifts, single pixels, zero
         points of images. All of it is in the errors of stars, and what these show of it is taken
         into the PSFs of the reconstruction. By default 0.03, as real PSFs have
-        (:doc:`/validation/psf_priors`), or what PSFs of ``lnocl psf`` bring, less by several stars.
+        (:doc:`/validation/psf_priors`), or what PSFs of ``lnocl psf`` bring, less where these are
+        of several stars.
     star_psfs : array_like, shape (n, p, ky, kx), (p, ky, kx) or (ky, kx), optional
         PSFs of their own of the stars at `star_places`, such as one behind the mask of a
         coronagraph. All else has `psfs`: other stars, the extended source and what is tested. They
@@ -229,13 +230,13 @@ class Observation:
           the sum of a PSF is more than 1.
         - Images or background exceed 1e30 electrons in a pixel, with exposure and read noise.
         - No good pixel is left, or an offset leaves nothing of an image.
-        - `psf_error` is not from 0 to 0.3.
+        - `psf_error` is not from 0 to 0.3, or `psf_centre` is not one of its three.
         - A halo is 0 on all good pixels of an image.
         - `transmission` is not of the sky's shape, out of range, or 0 everywhere in the images that
           have good pixels.
         - A label of `epochs` is missing or not a number, or the labels have no order.
-        - `transforms` are given beside `offsets`, shear the images by more than 0.05 pixels, or are
-          for pixels smaller than those of the image that the sky is of.
+        - `transforms` are given beside `offsets`, or shear the images by more than 0.05 pixels.
+        - Pixels of an image are smaller than those of the sky, by its transform.
 
     Warns
     -----
@@ -251,7 +252,7 @@ class Observation:
     References
     ----------
     D. L. Snyder, A. M. Hammoud, R. L. White, J. Opt. Soc. Am. A 10, 1014 (1993), for the read
-    noise; La Camera et al. (2012), Eq. 1 and 7, for the model.
+    noise; La Camera et al. (2012), Eq. 1 and 6, for the model.
 
     Examples
     --------
@@ -458,10 +459,23 @@ class Observation:
         return good_box(self.mask[j])
 
     def on_fine_pixels(self, j: int) -> tuple[Array, Array, Box]:
-        """Return the map from the sky to image j, and its `good_box`, in pixels as fine as the sky.
+        """Return the map from pixels of the sky to fine pixels of image j, and its box of them.
 
-        Those of the image are numbered from the middle of its first, and its own are each
-        `oversample`-th of them. So pixel u of the sky is at ``M u + t``, shapes (2, 2) and (2,).
+        Fine pixels are `oversample` times as fine as the image's, as those of the sky are. They are
+        counted from the centre of the image's first pixel, so that its pixel x is fine pixel
+        ``oversample * x``.
+
+        Parameters
+        ----------
+        j : int
+            The image, from 0 on.
+
+        Returns
+        -------
+        M, t : ndarray of float64, shapes (2, 2) and (2,)
+            Pixel u = (x, y) of the sky, 0-based, is at ``M u + t``.
+        box : (range, range)
+            Rows and columns of fine pixels, those of `good_box`.
         """
         q, turn = self.oversample, self.turns[j]
         rows, columns = (range(q * at.start, q * at.stop) for at in self.good_box(j))
@@ -601,7 +615,19 @@ class Observation:
         return other._closed()
 
     def transmission_of(self, rows: range, columns: range) -> Array:
-        """Return that of rows and columns of the sky; beyond its frame that of the nearest."""
+        """Return the `transmission` of some rows and columns of the sky.
+
+        Parameters
+        ----------
+        rows, columns : range
+            In pixels of the images, 0-based. Beyond the frame of the sky the transmission is that
+            of the nearest pixel.
+
+        Returns
+        -------
+        ndarray of float64, shape (p, q len(rows), q len(columns))
+            With q for `oversample`; of shape (0, 0, 0) where no transmission was given.
+        """
         given, q = self.transmission, self.oversample
         if not len(given):
             return given

@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from lnocl.core.scene.arrays import Array, numbers
+from lnocl.core.scene.arrays import Array, numbers, whole
 from lnocl.core.scene.quantities import bare, in_unit
 from lnocl.errors import InputError, counted
 
@@ -19,22 +19,23 @@ class PsfField:
     """PSFs that vary over an image, given at the nodes of a grid of positions.
 
     Between four nodes the PSF is bilinear, ``K = sum_i w_i K_i``, with weights w_i that sum to 1,
-    as `photutils.psf.GriddedPSFModel` defines it. Beyond the nodes it is constant.
+    as `photutils.psf.GriddedPSFModel` defines it. Beyond the nodes it is that of the nearest place
+    of the grid.
 
     Parameters
     ----------
     psfs : array_like, shape (n, ky, kx)
-        PSF of each node, with its centre at ``(ky // 2, kx // 2)``. `lnocl.Observation` normalises
-        the sums to 1.
+        PSF of each node, with its centre at ``(ky // 2, kx // 2)``, held as it is given.
+        `lnocl.Observation` normalises the sum of each to 1, and refuses what cannot be a PSF.
     positions : array_like, shape (n, 2)
-        (x, y) of the nodes, pixels of the image, 0-based. They fill a rectangular grid. They may be
-        a Quantity in pixels.
+        (x, y) of the nodes, pixels of the image, 0-based, in any order. They fill a rectangular
+        grid of one node or more. They may be a Quantity in pixels.
 
     Raises
     ------
     InputError
-        The shapes do not agree, positions are not finite or not in pixels, or they do not fill a
-        grid.
+        - The shapes do not agree, or a value is masked or not a real number.
+        - Positions are not finite, not in pixels, or do not fill a grid.
 
     See Also
     --------
@@ -112,9 +113,8 @@ class PsfField:
         """
         x, y = in_unit("x", x, "pix"), in_unit("y", y, "pix")
         (i, u), (j, v) = _between(self._x, x), _between(self._y, y)
-        weights = np.outer(v, u)
         cell = self._psfs[j : j + len(v), i : i + len(u)]
-        return np.asarray(np.tensordot(weights, cell, axes=2))
+        return np.asarray(np.tensordot(np.outer(v, u), cell, axes=2))
 
     @property
     def nodes(self) -> tuple[Array, Array]:
@@ -122,7 +122,10 @@ class PsfField:
         return self._x, self._y
 
     def numbers(self) -> Array:
-        """Return all numbers that it holds, for a checksum."""
+        """Return the PSFs, row by row of the grid, and the x and y of its lines, in one dimension.
+
+        They differ where two fields do, so that a checksum of them tells fields apart.
+        """
         return np.concatenate([self._psfs.ravel(), self._x, self._y])
 
     @property
@@ -172,7 +175,13 @@ class PsfField:
         Returns
         -------
         PsfField
-            The model's PSFs, sampled at that interval at the nodes of the model.
+            The PSFs at the nodes of the model, sampled at that interval from their centre on, as
+            far as the model's samples reach. Values are the model's, of a flux of 1.
+
+        Raises
+        ------
+        InputError
+            `oversample` is not a whole number, 1 or more.
 
         Examples
         --------
@@ -185,6 +194,7 @@ class PsfField:
         >>> PsfField.of_model(model, oversample=2).shape
         (9, 9)
         """
+        whole("oversample", oversample, 1)
         sizes = np.array(model.data.shape[1:]) / model.oversampling * oversample
         half_y, half_x = ((sizes - 1) // 2).astype(int).tolist()
         y, x = np.mgrid[-half_y : half_y + 1, -half_x : half_x + 1] / oversample

@@ -93,6 +93,11 @@ def spelled(names: Iterable[str], *wanted: str) -> list[str] | None:
     return [first for (first,) in found]
 
 
+def once_each(rows: Any) -> Any:
+    """Return a table with each star once: those of lnocl have a row for each of several epochs."""
+    return rows[rows["epoch"] == 0] if {"epoch", "variation_error"} <= {*rows.colnames} else rows
+
+
 def in_pixels(table: Any, columns: Columns, name: str) -> Array:
     """Return positions (x, y), pixels, 0-based, shape (n, 2).
 
@@ -129,7 +134,7 @@ def positions(table: Any, name: str = "stars") -> Array:
             f"{', '.join(table.colnames) or 'no columns'}: rename two, or convert RA and Dec with "
             "world_to_pixel of astropy.wcs"
         )
-    return in_pixels(table, columns, name)
+    return in_pixels(once_each(table), columns, name)
 
 
 def column_numbers(column: Any, name: str, unit: str) -> Array:
