@@ -131,7 +131,7 @@ def restoration_error(
 
     References
     ----------
-    La Camera et al. (2012), Eq. 9.
+    La Camera et al. (2012), Eq. 11.
 
     Examples
     --------

@@ -257,7 +257,7 @@ def test_a_result_has_the_fit_of_each_epoch():
     first, second, third = judge(observation, result.models())
     assert result.fit(57000.5) == first.plus(third)
     assert result.fit("57001") == second
-    with pytest.raises(InputError, match=r"`epoch` is 'May'; give one of 57000.5, 57001"):
+    with pytest.raises(InputError, match=r"epoch is 'May'; give one of 57000.5, 57001"):
         result.fit("May")
 
 

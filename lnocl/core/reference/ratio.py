@@ -24,7 +24,7 @@ def ratio_rows(
     """Return the row spectra of ``r_j - w_j``, the objective's data term, and the star sums.
 
     ``m_j = A_j f + sum_s c_s P_js + b_j``, ``r_j = w_j g_j / m_j``, ``sum_j <P_js, r_j - w_j>`` and
-    ``J_0 = sum w_j (g_j ln(g_j / m_j) + m_j - g_j)``; La Camera et al. (2012), Eq. 6 and 8.
+    ``J_0 = sum w_j (g_j ln(g_j / m_j) + m_j - g_j)``; La Camera et al. (2012), Eq. 7 and 9.
     Of the columns of ``A_j f``, each in `oversample` of them is an image's; the ratios lie there,
     and 0 in the others. Where ``m_j`` is not above `MIN_MODEL`, ``r_j = 0`` and ``m_j = MIN_MODEL``
     in J_0.

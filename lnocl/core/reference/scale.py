@@ -26,7 +26,7 @@ def scale_rows(
     ``f <- f (1 + a u) / (1 + (mu + curvature) f a)``, ``u = c + curvature f - slope``, with
     ``c = sum_j A_j^T (r_j - w_j)`` and ``a = 1 / sum_j A_j^T w_j``, 0 where nothing was observed;
     ``c_s`` becomes ``c_s (p_s u_s + q_s c0_s) / (p_s + q_s c_s)``, with its correction u_s, its
-    weight p_s, and its prior's flux and precision c0_s and q_s; La Camera et al. (2012), Eq. 8, as
+    weight p_s, and its prior's flux and precision c0_s and q_s; La Camera et al. (2012), Eq. 9, as
     ``sum_j A_j^T w_j`` is what ``r_j = w_j`` gives. slope and curvature, of the edge-preserving
     term (`smooth`), split its gradient into curvature f and what is left, neither negative.
     A correction ``1 + a u`` that rounding has made negative counts as 0.

@@ -11,7 +11,7 @@ from lnocl.core.scene.arrays import Array
 from lnocl.core.scene.cores import off_centre
 from lnocl.core.scene.observation import Observation
 from lnocl.core.scene.scene import Scene
-from lnocl.errors import DivergedError, refuse_not_finite
+from lnocl.errors import DivergedError, counted, refuse_not_finite
 
 # With PSFs that are nowhere negative the split-gradient method lowers the objective, but for
 # rounding and for a Tikhonov term that outweighs the data, with which every other objective is
@@ -67,11 +67,8 @@ class Descent:
 
 def explain_rise(observation: Observation) -> str:
     """Return the faults of PSFs that may make an objective rise, with their remedies."""
-    findings = [
-        *_negative_pixels(observation.psfs),
-        *_off_centre(observation.psfs),
-        *_level(observation.psfs),
-    ]
+    psfs = observation.psfs
+    findings = [*_negative_pixels(psfs), *_off_centre(psfs), *_level(psfs)]
     if not findings:
         return (
             "nothing in the psfs explains it; take precision double, and if it rises there too, "
@@ -86,12 +83,8 @@ def _negative_pixels(psfs: Array) -> list[str]:
     if shares[j] == 0:
         return []
     n_negative = int((psfs[j] < 0).sum())
-    pixels = (
-        "1 pixel of `psfs[{}]` is"
-        if n_negative == 1
-        else f"{n_negative} pixels of `psfs[{{}}]` are"
-    )
-    return [f"{pixels.format(j)} negative, {100 * shares[j]:.3g} % of its sum"]
+    pixels, are = counted(n_negative, "pixel"), "is" if n_negative == 1 else "are"
+    return [f"{pixels} of `psfs[{j}]` {are} negative, {100 * shares[j]:.3g} % of its sum"]
 
 
 def _off_centre(psfs: Array) -> list[str]:

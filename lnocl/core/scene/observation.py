@@ -252,7 +252,7 @@ class Observation:
     References
     ----------
     D. L. Snyder, A. M. Hammoud, R. L. White, J. Opt. Soc. Am. A 10, 1014 (1993), for the read
-    noise; La Camera et al. (2012), Eq. 1 and 6, for the model.
+    noise; La Camera et al. (2012), Eq. 1 and 7, for the model.
 
     Examples
     --------

@@ -225,10 +225,8 @@ class LeastSquares:
         rests = np.array([self._adjoint(self._changes(column)) for column in columns])
         least = self._finished**2 * _sum("ik,ik->i", rests, rests)
         for _ in columns:
-            squares, enough = (
-                _sum("ik,ik->i", rests, rests),
-                np.maximum(least, MISSING * np.diag(found)),
-            )
+            squares = _sum("ik,ik->i", rests, rests)
+            enough = np.maximum(least, MISSING * np.diag(found))
             worst = int(np.argmax(squares / enough))
             if squares[worst] <= enough[worst]:
                 break
