@@ -245,9 +245,10 @@ def _settle(runs: GuardedRuns, state: _State, moves: bool) -> _State:
     """Return the state with PSFs that are the mean of what they may be, where they fit better.
 
     That mean takes the extended source to be as smooth as its prior. Where it is not, PSFs that are
-    right would follow it, and their images fit worse: each PSF stays that fits no better so. None
-    is used with which all fit worse, or a star loses its light. Stars that were moved are moved
-    again for these, but where they follow a host from a flat sky.
+    right would follow it, and their images fit worse. So where PSFs are not in doubt each stays
+    that fits no better so. Where they are, what one of them fits is as much by the others, and all
+    stay together, if all fit worse. None is used with which a star loses its light. Stars that were
+    moved are moved again for these, but where they follow a host from a flat sky.
     """
     psfs, stars = runs.settled(state.psfs, state.places, moves)
     is_moved = bool((stars != state.places).any())
@@ -255,7 +256,7 @@ def _settle(runs: GuardedRuns, state: _State, moves: bool) -> _State:
         return state
     settled = _State.of(runs, psfs, stars, state.moves or is_moved)
     numbers, rise = alike(runs.whole.observation), settled.misfit.excess - state.misfit.excess
-    stays = (np.bincount(numbers, rise) >= 0)[numbers]
+    stays = (np.bincount(numbers, rise) >= 0)[numbers] & (not state.misfit.is_doubtful)
     if stays.all() and not is_moved:
         return state
     if stays.any():
