@@ -90,7 +90,7 @@ def table_of(name: str, part: Content, saved: SavedResult) -> Table:
     header, values = part.header, {key: np.asarray(each) for key, each in part.values.items()}
     units = {header[f"TTYPE{i}"]: header.get(f"TUNIT{i}", "") for i in range(1, len(values) + 1)}
     if name == "HALOS" or "electron" in str(saved.header.get("BUNIT")):  # for which FITS has none
-        units = {key: unit.replace("ct", "electron") for key, unit in units.items()}
+        units = {key: re.sub(r"\bct\b", "electron", unit) for key, unit in units.items()}
     if name == "ERRORS":
         is_one = np.isnan(values.pop("at"))  # profiles are drawn by lnocl plot
         unbiased = values.pop("value") - values.pop("bias")

@@ -248,6 +248,13 @@ class TestCommand:
         for row in rows:
             assert "".join(f"<td>{cell}</td>" for cell in row) in page
 
+    @pytest.mark.parametrize("unit", ["ct", "electron"])
+    def test_electrons_are_named_whatever_the_table_calls_them(self, unit):
+        columns = [Column(name, [3.0]) for name in "xy"]
+        columns += [Column("flux", [50.0], unit), Column("kind", ["point"])]
+        fitswrite.write_result("b.fits", np.ones((8, 8)), [], [], {"DETECTIONS": columns})
+        assert "<th>flux (electron)</th>" in reports.report("b.fits")
+
     def test_page_has_sections_for_measured_tables_only(self):
         regions = [Column("name", ["ring"]), Column("x", [4.0], "pix"), Column("flux", [50.0])]
         regions += [Column("error", [3.0]), Column("unit", ["adu"]), Column("note", [""])]
