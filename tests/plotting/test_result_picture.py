@@ -210,6 +210,8 @@ def test_an_outline_leaves_the_enlarged_part_as_it_is(shape):
 def test_the_choice_is_that_of_held_out_counts_or_the_objective():
     def curve(view):
         (axis,) = draw_result(view).subfigs[1].axes
+        assert axis.get_xlabel() == f"iteration (dotted: {view.n_iter}, the result)"
+        assert not axis.texts  # on which the legend may lie
         return axis.get_ylabel(), {line.get_label(): line.get_ydata() for line in axis.lines}
 
     name, found = curve(make_view())
