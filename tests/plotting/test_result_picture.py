@@ -246,7 +246,8 @@ def test_from_a_file_it_is_the_same(result, tmp_path):
         np.testing.assert_allclose(one.get_array(), other.get_array(), rtol=1e-5, atol=1e-5)
     bad = result._outcome.scene.observation.mask
     assert bad.any()
-    np.testing.assert_array_equal(np.isnan(view_of(result).images), bad)
+    for cube in (view_of(result).images, view_of(result).models):
+        np.testing.assert_array_equal(np.isnan(cube), bad)
     held = view_of(result), figures.view_of(read_result(str(path)))
     assert held[0].n_iter == held[1].n_iter == 3
     assert held[0].stars == held[1].stars
