@@ -171,11 +171,11 @@ def draw_images(device, path):
         "default": (lnocl.deconvolve, "check", {"pad": 0}),
         "centred": (lnocl.deconvolve, "fit", {"pad": 0}),
     }
-    figure, axes = plt.subplots(3, 6, figsize=(15, 8), layout="constrained")
+    figure, axes = plt.subplots(3, 6, figsize=(15, 9.5), layout="constrained")
     shown = {"vmin": 0.0, "vmax": extended.max(), "origin": "lower"}
     for row, (way, (deconvolve, centre, settings)) in zip(axes, ways.items(), strict=True):
         row[0].imshow(extended, **shown)
-        row[0].set_title("truth", fontsize=9)
+        row[0].set_title("truth", fontsize=12)
         for axis, name in zip(row[1:], names, strict=True):
             try:
                 known = {"background": LEVEL, "psf_centre": centre}
@@ -183,14 +183,14 @@ def draw_images(device, path):
                 result = deconvolve(observation, [STAR], device=device, **settings)
             except (lnocl.InputError, DivergedError) as error:
                 end = "refused" if isinstance(error, lnocl.InputError) else "diverges"
-                axis.set_title(f"{name}, {way}: {end}", fontsize=9)
+                axis.set_title(f"{name}, {way}:\n{end}", fontsize=12)
                 continue
             (found,) = result.star_residuals()
             axis.imshow(result.extended, **shown)
             axis.set_title(
                 f"{name}, {way}\nflux {result.star_fluxes[0] / flux:.2f}, core rms "
-                f"{found.core.rms:.1f}, halo {found.halo:.2f}",
-                fontsize=9,
+                f"{found.core.rms:.1f}\nhalo {round(found.halo, 2):.4g}",
+                fontsize=12,
             )
     for axis in axes.flat:
         axis.set_axis_off()

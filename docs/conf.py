@@ -82,7 +82,7 @@ html_sidebars = {"comparison": [], "glossary": []}
 html_theme_options = {
     "show_prev_next": True,
     "navigation_with_keys": False,
-    "header_links_before_dropdown": 7,
+    "header_links_before_dropdown": 6,
 }
 # Commands are copied without their prompts and outputs.
 copybutton_prompt_text = r">>> |\.\.\. |\$ "

@@ -356,9 +356,11 @@ def deconvolve(
     References
     ----------
     A. La Camera, S. Antoniucci, M. Bertero et al., "Image reconstruction for observations with a
-    high dynamic range: LINC-NIRVANA simulations of a stellar jet", Proc. SPIE 8445 (2012), Eq. 7 to
-    9. S. Bonettini, R. Zanella, L. Zanni, "A scaled gradient projection method for constrained
-    image deblurring", Inverse Problems 25, 015002 (2009).
+    high dynamic range: LINC-NIRVANA simulations of a stellar jet", Proc. SPIE 8445 (2012), Eq. 7
+    to 9.
+
+    S. Bonettini, R. Zanella, L. Zanni, "A scaled gradient projection method for constrained image
+    deblurring", Inverse Problems 25, 015002 (2009).
 
     Examples
     --------

@@ -412,14 +412,22 @@ def test_a_field_in_which_nothing_is_tested_is_refused(result):
         result.significance(width=63.0)
 
 
+LIMIT_TITLE = "flux that is found with a probability of 50 %"
+
+
 def test_the_picture_has_the_map_the_limits_and_the_curves(found):
     figure = found.plot()
     titles = [axes.get_title() for axes in figure.axes if axes.get_title()]
     assert titles[0].startswith(f"points: {len(found.detections)} above {found.threshold:.2f}")
-    assert titles[1:] == [
-        "found with a probability of 50 %",
-        f"limits at {found.threshold:.2f} sigma\nnear a star by Student's t (Mawet et al. 2014)",
-    ]
+    curves = f"limits at {found.threshold:.2f} sigma, near a star by Student's t"
+    for title, begin in zip(titles[1:], (LIMIT_TITLE, curves), strict=True):
+        assert title.startswith(begin)
+    figure.draw_without_rendering()
+    maps = [axes for axes in figure.axes if axes.images]
+    for each in maps:  # colour bars have labels, not powers of ten alone
+        (bar,) = each.child_axes
+        low, high = bar.get_ylim()
+        assert sum(low <= y <= high for y in bar.get_yticks()) >= 3
     axes = {axes.get_ylabel(): axes for axes in figure.axes}
     curves, magnitudes = axes["contrast"], axes["magnitudes below the star"]
     assert curves.get_xlabel() == "separation (pixels)"
@@ -445,7 +453,8 @@ def test_a_star_without_light_has_no_curve_in_the_picture():
     with ignored_warnings():
         result = lnocl.deconvolve(observation, [(9, 11)], stop=None, n_iter=5, engine="numpy")
     titles = [axes.get_title() for axes in result.significance().plot().axes if axes.get_title()]
-    assert titles[1:] == ["found with a probability of 50 %"]
+    (title,) = titles[1:]
+    assert title.startswith(LIMIT_TITLE)
 
 
 @pytest.mark.parametrize(

@@ -16,6 +16,7 @@ from lnocl.commands.parser import Command
 from lnocl.errors import counted
 from lnocl.process import ignored_notes
 from lnocl.result import Result
+from lnocl.result.summary import with_error
 
 if TYPE_CHECKING:
     from astropy.table import QTable
@@ -130,15 +131,12 @@ def _summary_lines(found: Significance, table: QTable) -> list[str]:
         f"({100 * np.isfinite(found.signal_to_noise).mean():.3g} % of it was tested for a {what})"
     ]
     for k, row in enumerate(table[:MAX_LISTED], 1):
-        flux, error = row["flux"], row["flux_error"]
-        where = (
-            f" at {row['distance'].value:.1f} pixels from star {row['star']}" if row["star"] else ""
-        )
+        flux, away = with_error(row["flux"].value, row["flux_error"].value), row["distance"].value
+        where = f" at {away:.1f} pixels from star {row['star']}" if row["star"] else ""
         kind = "" if row["kind"] == "point" or found.width else ": the extended source could be it"
         lines.append(
             f"{k}: ({row['x'].value:.2f}, {row['y'].value:.2f}){where}, signal-to-noise "
-            f"{row['significance']:.1f}, flux {flux.value:.4g} +- {error.value:.2g} "
-            f"{flux.unit}{kind}"
+            f"{row['significance']:.1f}, flux {flux} {row['flux'].unit}{kind}"
         )
     if len(table) > MAX_LISTED:
         lines.append(f"and {len(table) - MAX_LISTED} more in the table DETECTIONS")

@@ -22,6 +22,7 @@ from lnocl.core.scene.apertures import Aperture
 from lnocl.errors import FileError, InputError, note
 from lnocl.process import ignored_notes
 from lnocl.result import Result
+from lnocl.result.summary import rounded, with_error
 
 if TYPE_CHECKING:
     from astropy.table import QTable
@@ -234,13 +235,13 @@ def _summarise(found: Bootstrap, parts: Sequence[Part], frames: Frames) -> list[
         if not _OF_STARS.fullmatch(row["name"]) and np.isfinite(row["share"]):
             note = f"; has light in {100 * row['share']:.0f} % of replicas{note}"
         if len(found.of_psfs):
-            note += f"; noise {row['error_noise']:.2g}, PSF {row['error_psf']:.2g}"
+            noise, psf = (rounded(*[row[each]] * 2) for each in ("error_noise", "error_psf"))
+            note += f"; noise {noise}, PSF {psf}"
         if "error_smoothing" in table.colnames and row["error"] <= row["error_smoothing"]:
             note += "; smoothing changes it by as much as the error"
-        lines.append(
-            f"{row['name']}: {row['value'] - row['bias']:.6g} +- {row['error']:.2g} "
-            f"{row['unit']} ({row['low95']:.6g} to {row['high95']:.6g}{note})"
-        )
+        low, high = (rounded(row[end], row["error"]) for end in ("low95", "high95"))
+        value = with_error(row["value"] - row["bias"], row["error"])
+        lines.append(f"{row['name']}: {value} {row['unit']} ({low} to {high}{note})")
     if len(table) > n_listed:
         lines.append(f"and {len(table) - n_listed} more in the table ERRORS")
     return lines

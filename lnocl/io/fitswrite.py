@@ -197,10 +197,11 @@ def history_lines(words: Sequence[str]) -> list[str]:
     ["lnocl deconvolve 'a star.fits' -o $'na\\303\\257ve.fits'"]
     """
     lines, line = [], ""
-    for word in words:
+    for word, value in zip(words, [*words[1:], ""], strict=True):
         for i, piece in enumerate(_shell_pieces(word)):
             gap = " " if line and i == 0 else ""
-            if line and len(line + gap + piece) > HISTORY_WIDTH:
+            kept = f"{piece} {value}" if word.startswith("--") else piece  # on one line
+            if line and len(line + gap + kept) > HISTORY_WIDTH:
                 lines.append(line + gap + "\\")
                 line, gap = "", ""
             line += gap + piece

@@ -92,8 +92,7 @@ class SavedResult:
 
     def commands(self) -> str:
         """Return the lines of a shell that repeat the run in its folder, which is left out."""
-        lines = "\n".join(map(str, self.header.get("HISTORY", ())))
-        commands = re.split(r"(?<!\\)\n", lines)
+        commands = re.split(r"(?<!\\)\n", "\n".join(map(str, self.header.get("HISTORY", ()))))
         return "\n".join(command for command in commands if not command.startswith("cd "))
 
     def command_words(self) -> list[list[str]]:

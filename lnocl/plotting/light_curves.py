@@ -65,10 +65,11 @@ def draw(axis: Axes, curves: LightCurves) -> None:
     for i, s in enumerate(shown[means[shown] > 0]):
         flux, error = curves.fluxes[s] / means[s], curves.errors[s] / means[s]
         style = line_style(i) | {"lw": 0.8, "marker": "o", "ms": 3}
-        label = f"star {s + 1}, mean {means[s]:.4g} {as_text(curves.unit)}"
+        mean = f"{float(f'{means[s]:.4g}'):,.7g}".replace(",", " ")
+        label = f"star {s + 1}, mean {mean} {as_text(curves.unit)}"
         axis.errorbar(epochs, flux, np.nan_to_num(error), capsize=2, label=label, **style)
-    axis.set_title("light curves", fontsize=9)
-    axis.set_ylabel("flux / mean", fontsize=9)
+    axis.set_title("light curves, with the errors of the changes", fontsize=9)
+    axis.set(xlabel="epoch", ylabel="flux / mean")
     _mark(axis, epochs, curves.labels)
     if axis.containers:
         axis.legend(fontsize=8, loc="center left", bbox_to_anchor=(1.0, 0.5))
@@ -80,7 +81,6 @@ def _mark(axis: Axes, epochs: NDArray[Any], labels: Sequence[str]) -> None:
     from matplotlib.dates import AutoDateLocator, ConciseDateFormatter
     from matplotlib.ticker import MaxNLocator
 
-    axis.set_xlabel("epoch")
     if epochs.dtype.kind == "M":
         locator = AutoDateLocator(maxticks=8)
         axis.xaxis.set_major_locator(locator)

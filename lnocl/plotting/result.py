@@ -351,7 +351,8 @@ def draw_choice(axis: Axes, view: ResultView) -> None:
             f"{value:.2g}": (table["smoothing"] == value, 100 * table["error"])
             for value in np.unique(table["smoothing"])
         }
-        axis.set_title("held-out counts: the last within a tenth of the least is taken", fontsize=9)
+        rule = "the last iteration whose error is within a tenth of the least"
+        axis.set_title(f"held-out counts take {rule}", fontsize=9)
         label = "estimated error (%)"
     else:
         table = view.history
@@ -371,16 +372,8 @@ def draw_choice(axis: Axes, view: ResultView) -> None:
         axis.legend(fontsize=8, title="smoothing", title_fontsize=8)
     if view.n_iter > 0:
         axis.axvline(view.n_iter, color="0.4", lw=1, ls=":")
-        axis.annotate(
-            f"iteration {view.n_iter} ",
-            (view.n_iter, 0.95),
-            xycoords=("data", "axes fraction"),
-            ha="right",
-            va="top",
-            fontsize=8,
-            color="0.4",
-        )
-    axis.set(xscale="log", yscale="log", xlabel="iteration")
+    taken = f" (dotted: {view.n_iter}, the result)" if view.n_iter > 0 else ""
+    axis.set(xscale="log", yscale="log", xlabel=f"iteration{taken}")
     for each in (axis.xaxis, axis.yaxis):
         each.set_major_formatter(LogFormatter())
         each.set_minor_formatter(LogFormatter())

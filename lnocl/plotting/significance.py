@@ -10,6 +10,7 @@ import numpy as np
 
 from lnocl.core.scene.arrays import Array
 from lnocl.plotting.figure import (
+    COLOUR_MAP,
     COLOURS,
     MOST_NUMBERED,
     MOST_STARS,
@@ -92,26 +93,24 @@ def _draw_signal(axis: Axes, view: SignificanceView) -> None:
     from matplotlib.colors import Normalize
 
     signal, most = np.asarray(view.signal), SHOWN * view.threshold
-    extent = extent_of(signal.shape, view.oversample)
-    shown = show_image(axis, signal, Normalize(-most, most), extent, "RdBu_r")
-    axis.figure.colorbar(shown, ax=axis, label="signal-to-noise")
-    n = _mark_sources(axis, view)
+    n = _draw_map(axis, view, signal, Normalize(-most, most), "RdBu_r", "signal-to-noise")
     what = "points" if not view.width else f"sources {view.width:g} pixels wide"
-    title = f"{what}: {n} above {view.threshold:.2f}\ncircles: points; squares: perhaps extended"
-    axis.set_title(title, fontsize=9)
+    title = f"{what}: {n} above {view.threshold:.2f}; grey: not tested; crosses: stars"
+    axis.set_title(f"{title}\ncircles: points; squares: perhaps extended", fontsize=9)
 
 
 def _draw_limit(axis: Axes, view: SignificanceView) -> None:
     from matplotlib.colors import LogNorm
+    from matplotlib.ticker import LogLocator, MaxNLocator
 
     limit = np.asarray(view.limit)
     good = limit[np.isfinite(limit) & (limit > 0)]
     low, high = (good.min(), np.quantile(good, 0.999)) if good.size else (1.0, 10.0)
     norm = LogNorm(low, max(high, 1.01 * low))
-    shown = show_image(axis, limit, norm, extent_of(limit.shape, view.oversample))
-    axis.figure.colorbar(shown, ax=axis, label=f"flux ({as_text(view.unit)})")
-    _mark_sources(axis, view)
-    axis.set_title("found with a probability of 50 %", fontsize=9)
+    ticks = LogLocator(subs=(1.0, 2.0, 5.0)) if high > 5 * low else MaxNLocator(6)
+    _draw_map(axis, view, limit, norm, COLOUR_MAP, f"flux ({as_text(view.unit)})", ticks)
+    title = "flux that is found with a probability of 50 %"
+    axis.set_title(f"{title}\ngrey: not tested, or a point found; crosses: stars", fontsize=9)
 
 
 def _draw_curves(axis: Axes, view: SignificanceView) -> None:
@@ -141,8 +140,9 @@ def _draw_curves(axis: Axes, view: SignificanceView) -> None:
     axis.xaxis.set_major_formatter("{x:g}")
     axis.xaxis.set_minor_locator(NullLocator())
     axis.grid(alpha=0.3)
-    title = f"limits at {view.threshold:.2f} sigma"
-    axis.set_title(f"{title}\nnear a star by Student's t (Mawet et al. 2014)", fontsize=9)
+    title = f"limits at {view.threshold:.2f} sigma, near a star by Student's t (Mawet et al. 2014)"
+    marks = "\ncircles: points found; squares: perhaps extended" if view.detections else ""
+    axis.set_title(f"{title}{marks}", fontsize=9)
     axis.legend(fontsize=8)
     right = axis.twinx()
     right.set_ylim(*(-2.5 * np.log10(axis.get_ylim())))
@@ -165,8 +165,14 @@ def _mark_contrasts(
             axis.annotate(f"{i + 1}", at, (6, 6), textcoords="offset points", fontsize=8)
 
 
-def _mark_sources(axis: Axes, view: SignificanceView) -> int:
-    """Mark stars and detections of a map, bright and dark; return how many detections it has."""
+def _draw_map(
+    axis: Axes, view: SignificanceView, values: Array, norm: Any, colours: str, label: str,
+    ticks: Any = None,
+) -> int:  # fmt: skip
+    """Draw a map and mark its stars and detections; return how many detections it has."""
+    shown = show_image(axis, values, norm, extent_of(values.shape, view.oversample), colours)
+    beside = axis.inset_axes((1.03, 0.0, 0.05, 1.0))  # as high as the map
+    axis.figure.colorbar(shown, cax=beside, label=label, ticks=ticks, format="{x:g}")
     dark = outlined("black", "white")
     for place in view.stars:
         axis.plot(*place, "+", ms=8, mew=1.2, **dark)

@@ -47,7 +47,7 @@ def draw_stars(image: Array, stars: Mapping[str, Any]) -> Figure:
     x, y = (np.asarray(stars[name], float) for name in ("x", "y"))
     size = 9 if len(x) <= MAX_NUMBERED else 4
     for chosen, colour in ((~saturated, COLOURS[1]), (saturated, COLOURS[0])):
-        axis.plot(x[chosen], y[chosen], "o", ms=size, mfc="none", mec=colour, mew=1.0)
+        axis.plot(x[chosen], y[chosen], "o", ms=size, mfc="none", **outlined(colour, "white"))
     for i in np.argsort(-np.asarray(stars["peak"], float))[:MAX_NUMBERED]:
         axis.annotate(
             f"{stars['star'][i]}", (x[i], y[i]), (4, 4), textcoords="offset points",

@@ -80,6 +80,11 @@ def with_error(value: float, error: float) -> str:
     return " +- ".join(numbers).replace(",", " ")
 
 
+def rounded(value: float, error: float) -> str:
+    """Return a number to two digits of its error, without it."""
+    return with_error(value, error).partition(" +- ")[0]
+
+
 def summary_lines(result: Result, unit: Unit | None = None, is_warned: bool = False) -> list[str]:
     """Return the fluxes of a result, whether to trust them, and how it ended, in a few lines.
 

@@ -121,7 +121,7 @@ def view_of(saved: SavedResult) -> ResultView:
         history=saved.tables.get("HISTORY", {}),
         held_out=saved.tables.get("HELDOUT", {}),
         images=images / electrons,
-        models=models / electrons,
+        models=np.where(np.isnan(images), np.nan, models) / electrons,  # without background there
         residuals=residuals,
         offsets=saved.offsets,
         turns=saved.turns,

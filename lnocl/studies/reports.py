@@ -19,7 +19,7 @@ from lnocl.plotting.figure import check_matplotlib
 from lnocl.plotting.report import Table, make_report
 from lnocl.plotting.result import ResultView
 from lnocl.plotting.significance import SignificanceView
-from lnocl.result.summary import with_error
+from lnocl.result.summary import rounded, with_error
 from lnocl.studies.figures import check_saved, view_of
 
 # The tables that are shown, and what those are of whose rows have numbers.
@@ -90,7 +90,7 @@ def table_of(name: str, part: Content, saved: SavedResult) -> Table:
     header, values = part.header, {key: np.asarray(each) for key, each in part.values.items()}
     units = {header[f"TTYPE{i}"]: header.get(f"TUNIT{i}", "") for i in range(1, len(values) + 1)}
     if name == "HALOS" or "electron" in str(saved.header.get("BUNIT")):  # for which FITS has none
-        units = {key: unit.replace("ct", "electron") for key, unit in units.items()}
+        units = {key: re.sub(r"\bct\b", "electron", unit) for key, unit in units.items()}
     if name == "ERRORS":
         is_one = np.isnan(values.pop("at"))  # profiles are drawn by lnocl plot
         unbiased = values.pop("value") - values.pop("bias")
@@ -106,26 +106,31 @@ def table_of(name: str, part: Content, saved: SavedResult) -> Table:
     errors = {key: values[f"{key}_error"] for key in values if f"{key}_error" in values}
     if "error" in values:
         errors |= dict.fromkeys(("flux", "value less bias"), values["error"])
+    # What has the digits of an error, and shows none: the ends of intervals, and errors.
+    alone = {key: each if "error" in key else values["error"] for key, each in values.items()
+             if re.search("error|^(low|high)\\d", key)}  # fmt: skip
     shown = {}
     for key, column in values.items():
         if key == "error" or (key.endswith("_error") and key[:-6] in errors):
             continue
         head = re.sub(r"(?<=[a-z])(\d+)$", r" \1 %", key.replace("_", " "))
-        unit, of_key = repeat(units.get(key, "")), errors.get(key, repeat(None))
-        cells = list(map(_cell, column.tolist(), unit, of_key))
+        unit, of_key = repeat(units.get(key, "")), errors.get(key, alone.get(key, repeat(None)))
+        cells = list(map(_cell, column.tolist(), unit, of_key, repeat(key in alone)))
         if any(cells):  # notes may be empty
             shown[f"{head} ({units[key]})" if units.get(key) else head] = cells
     return shown
 
 
-def _cell(value: Any, unit: str, error: float | None) -> str:
-    """Return a value in words, with its error where it has one."""
-    if isinstance(value, str):
-        return value
+def _cell(value: Any, unit: str, error: float | None, is_alone: bool) -> str:
+    """Return a value in words, with its error where it has one, or rounded by it alone."""
+    if isinstance(value, str | int):
+        return str(value)
+    if error is not None and is_alone:
+        return rounded(value, error)
     if error is not None:
         words = with_error(value, error).replace(" +- ", " \u00b1 ")
         return words if "\u00b1" in words else f"{words}, error unknown"
     if not np.isfinite(value):
-        return "unknown"
-    places = {"deg": ".6f", "pix": ".2f"}.get(unit, ".4g" if abs(value) < 1e4 else ".7g")
-    return f"{value:{places}}"
+        return "\u2013"
+    places = {"deg": ".6f", "pix": ".2f"}.get(unit, "#.3g" if abs(value) < 999.5 else "")
+    return f"{value:{places}}".rstrip(".") if places else rounded(value, abs(value) / 100)

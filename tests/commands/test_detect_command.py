@@ -45,6 +45,7 @@ def test_detections_are_printed_written_and_added_to_the_result(output, capsys):
     )
     assert said[1].startswith(("1: (44.9", "1: (45.0"))
     assert " pixels from star 1, signal-to-noise " in said[1]
+    assert re.search(r"flux [23] \d{3} \+- \d{1,3} electron$", said[1])
     assert said[-2:] == ["added to out.fits", f"written to {output}"]
     table = Table.read(output)
     assert table["kind"].tolist() == ["point"]

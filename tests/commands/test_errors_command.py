@@ -1,6 +1,7 @@
 """``lnocl errors``: what it writes and refuses."""
 
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -60,6 +61,9 @@ def test_errors_are_added_to_the_file(words, capsys):
     said = capsys.readouterr().out
     assert "errors by 10 replicas, less their bias; in brackets 95 %:\nround: " in said
     assert "below the resolution: do not trust its error)" in said
+    number = r"-?\d[\d ]*(\.\d+)?"  # to the digits of its error, without an exponent
+    shown = rf"round: {number} \+- {number} electron \({number} to {number}; has light"
+    assert re.search(shown, said)
     found = held()
     assert list(found)[-len(EXTENSIONS) :] == EXTENSIONS
     table = found["ERRORS"].data

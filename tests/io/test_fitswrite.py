@@ -121,6 +121,14 @@ NAMES = st.text(
 
 
 class TestHistoryLines:
+    def test_an_option_stays_on_the_line_of_its_value(self):
+        stars = [
+            word for x in range(9) for word in ("--star", f"64.30392124261{x},61.8020699660565")
+        ]
+        lines = fitswrite.history_lines(["lnocl", "deconvolve", "a.fits", *stars])
+        assert len(lines) > 4
+        assert all(line.split().count("--star") == line.count(",") for line in lines)
+
     @given(words=st.lists(NAMES, min_size=1, max_size=6))
     def test_history_cards_run_by_a_shell_reproduce_the_arguments(self, words):
         header = fits.Header()

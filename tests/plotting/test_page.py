@@ -187,7 +187,7 @@ class TestCommand:
         for part in ("<title>a.fits: RW Aur</title>", "lnocl deconvolve b.fits", "the model fits",
                      "<pre>the model fits</pre>",
                      "<ul class='warning'><li>warning: it is noisy", "<li>gain 2</li>",
-                     "<th>flux (adu)</th>", "<td>7.5</td>"):  # fmt: skip
+                     "<th>flux (adu)</th>", "<td>7.50</td>"):  # fmt: skip
             assert part in page
         assert "/home/me" not in page
         assert "datadata" not in page
@@ -248,20 +248,29 @@ class TestCommand:
         for row in rows:
             assert "".join(f"<td>{cell}</td>" for cell in row) in page
 
+    @pytest.mark.parametrize("unit", ["ct", "electron"])
+    def test_electrons_are_named_whatever_the_table_calls_them(self, unit):
+        columns = [Column(name, [3.0]) for name in "xy"]
+        columns += [Column("flux", [50.0], unit), Column("kind", ["point"])]
+        fitswrite.write_result("b.fits", np.ones((8, 8)), [], [], {"DETECTIONS": columns})
+        assert "<th>flux (electron)</th>" in reports.report("b.fits")
+
     def test_page_has_sections_for_measured_tables_only(self):
         regions = [Column("name", ["ring"]), Column("x", [4.0], "pix"), Column("flux", [50.0])]
         regions += [Column("error", [3.0]), Column("unit", ["adu"]), Column("note", [""])]
         errors = [Column("name", ["star 1 flux", "jet flux"]), Column("at", [np.nan, 3.0]),
                   Column("unit", ["adu", "adu"]), Column("note", ["", ""]),
                   Column("value", [9.0, 1.0]), Column("bias", [1.0, 0.0]),
-                  Column("error", [2.0, 0.5])]  # fmt: skip
+                  Column("error", [2.0, 0.5]), Column("error_noise", [0.0123, 0.5]),
+                  Column("low95", [4.1234, 0.0]), Column("share", [np.nan, 1.0])]  # fmt: skip
         parts = {"REGIONS": regions, "ERRORS": errors}
         fitswrite.write_result("b.fits", np.ones((16, 16)), [], [], parts, unit="adu")
         page = reports.report("b.fits")
         titles = ["Can it be trusted?", "Pictures", "Regions", "Errors", "How to make it again"]
         assert re.findall("<h2>(.*?)</h2>", page) == titles
         assert "<td>ring</td><td>4.00</td><td>50.0 ± 3.0</td><td>adu</td></tr>" in page
-        assert "<td>star 1 flux</td><td>8.0 ± 2.0</td><td>adu</td></tr>" in page
+        row = "star 1 flux", "8.0 ± 2.0", "adu", "0.012", "4.1", "\u2013"
+        assert "".join(f"<td>{cell}</td>" for cell in row) in page
         assert "jet flux" not in page  # a slice of a profile, which is drawn
         names = "x", "y", "flux", "kind"
         empty = {"REGIONS": [Column("name", np.array([], "U4"))],

@@ -157,10 +157,11 @@ def test_numbers_of_stars_are_read_on_any_colour():
     ],
 )
 def test_light_curves_are_below(labels, places, shown):
-    fluxes = np.array([[9.0, 11.0, 10.0], [0.0, 0.0, 0.0], [1.0, 2.0, 3.0]])
+    fluxes = np.array([[183600.0, 224400.0, 204000.0], [0.0, 0.0, 0.0], [1.0, 2.0, 3.0]])
     curves = light_curves(fluxes.ravel(), np.full(9, 0.5), labels, "electron")
     axis = draw_result(make_view(p=1, light_curves=curves)).subfigs[-1].axes[0]
-    assert axis.get_title() == "light curves"
+    assert axis.get_title().startswith("light curves")
+    assert (axis.get_xlabel(), axis.get_ylabel()) == ("epoch", "flux / mean")
     drawn = [container.lines[0].get_ydata() for container in axis.containers]
     np.testing.assert_allclose(drawn, [[0.9, 1.1, 1.0], [0.5, 1.0, 1.5]])  # one has no light
     at = axis.xaxis.convert_units(axis.containers[0].lines[0].get_xdata())
@@ -168,7 +169,7 @@ def test_light_curves_are_below(labels, places, shown):
     if shown:
         assert [text.get_text() for text in axis.get_xticklabels()] == shown
     assert [text.get_text() for text in axis.get_legend().texts] == [
-        "star 1, mean 10 electron",
+        "star 1, mean 204 000 electron",
         "star 3, mean 2 electron",
     ]
     assert light_curves(np.ones(2), np.ones(2), ["0"], "") is None
@@ -210,6 +211,8 @@ def test_an_outline_leaves_the_enlarged_part_as_it_is(shape):
 def test_the_choice_is_that_of_held_out_counts_or_the_objective():
     def curve(view):
         (axis,) = draw_result(view).subfigs[1].axes
+        assert axis.get_xlabel() == f"iteration (dotted: {view.n_iter}, the result)"
+        assert not axis.texts  # on which the legend may lie
         return axis.get_ylabel(), {line.get_label(): line.get_ydata() for line in axis.lines}
 
     name, found = curve(make_view())
@@ -243,7 +246,8 @@ def test_from_a_file_it_is_the_same(result, tmp_path):
         np.testing.assert_allclose(one.get_array(), other.get_array(), rtol=1e-5, atol=1e-5)
     bad = result._outcome.scene.observation.mask
     assert bad.any()
-    np.testing.assert_array_equal(np.isnan(view_of(result).images), bad)
+    for cube in (view_of(result).images, view_of(result).models):
+        np.testing.assert_array_equal(np.isnan(cube), bad)
     held = view_of(result), figures.view_of(read_result(str(path)))
     assert held[0].n_iter == held[1].n_iter == 3
     assert held[0].stars == held[1].stars

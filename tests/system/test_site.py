@@ -95,13 +95,31 @@ def look(browser):
 @pytest.mark.parametrize("page", [page for page in PAGES if page.parts[0] != "_modules"], ids=str)
 def test_no_page_is_wider_than_the_window(page, width, look, browser):
     look(page, width)
-    assert too_wide(browser, "html, .bd-article-container") == []
+    assert too_wide(browser, "html, .bd-article-container, .prev-next-area a") == []
 
 
 @pytest.mark.parametrize("page", [page for page in PAGES if page.parts[0] == "start"], ids=str)
 def test_no_block_of_getting_started_scrolls(page, look, browser):
     look(page)
     assert too_wide(browser, "pre") == []
+
+
+def test_a_table_is_as_wide_as_its_rows(look, browser):
+    look("comparison.html")
+    table, rows = (
+        browser.find_element("css selector", f"article {each}") for each in ("table", "tbody")
+    )
+    assert table.size["width"] <= rows.size["width"] + 2  # its border
+    assert table.location["x"] == browser.find_element("tag name", "h1").location["x"]
+
+
+def test_pictures_of_many_panels_can_be_read_on_a_phone(look, browser):
+    look("start/picture.html", PHONE)
+    widths = [each.size["width"] for each in browser.find_elements("css selector", "figure img")]
+    assert len(widths) == 4
+    assert min(widths) > 800
+    look("index.html", PHONE)
+    assert browser.find_element("css selector", "figure img").size["width"] < PHONE
 
 
 def too_wide(browser, selector):
