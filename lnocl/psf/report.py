@@ -176,9 +176,7 @@ def examine(psf: ArrayLike) -> PsfReport:
     outer = wings | border
     apart = abs(light - median_filter(light, 3))[outer]
     noise = OF_NOISE * float(np.median(apart)) if apart.size else 0.0
-    level, inner = (
-        float(np.median(light[ring])) if ring.any() else 0.0 for ring in (border, wings)
-    )
+    level, inner = (float(np.median(light[at])) if at.any() else 0.0 for at in (border, wings))
     fall = np.nan
     if level > 0 and inner > 0:
         fall = float(np.log(inner / level) / np.log(sum(BORDER) / sum(WINGS)))
