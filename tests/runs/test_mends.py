@@ -7,6 +7,8 @@ from astropy.io import fits
 import lnocl
 from lnocl.core.runs.plan import CORES, EXPOSURES, RAYS
 from lnocl.core.runs.preparation import prepare
+from lnocl.core.scene.saturation import rays_on_stars
+from lnocl.core.scene.scene import Scene
 from lnocl.result.kept import from_parts, to_parts
 
 SIZE, STAR, FLUX, LEVEL = 40, (20.3, 18.8), 1e6, 100.0
@@ -118,10 +120,11 @@ class TestRays:
         assert not mask[0].any()
         assert prepared.found[RAYS] == f"{mask.sum()} pixels of `images[1]`"
 
-    def test_those_on_the_star_are_found_beside_its_model(self):
+    @pytest.mark.parametrize("strength", [1e3, 4e3])
+    def test_those_on_the_star_are_found_beside_its_model(self, strength):
         image, _ = self.image()
         rays = np.zeros_like(image)
-        rays[17, 21] = 4e3
+        rays[17, 21] = strength
         given = lnocl.Observation([image + rays, image], PSF, background=LEVEL)
         mask = prepare(
             lnocl.plan(given, [STAR], engine="numpy", refine_psfs=())
@@ -129,6 +132,16 @@ class TestRays:
         assert mask[0, 17, 21]
         assert mask[0].sum() == mask[0, 16:19, 20:23].sum()  # with what the ray spreads to
         assert not mask[1].any()
+
+    @pytest.mark.parametrize("half", [0, 2])
+    def test_sharp_pixels_of_a_larger_patch_on_the_star_are_no_rays(self, half, monkeypatch):
+        """As a wrong PSF leaves it."""
+        image, _ = self.image()
+        image[17 - half : 18 + half, 21 - half : 22 + half] += 2e3
+        brightest = lambda left, *_: left == left.max()  # noqa: E731
+        monkeypatch.setattr("lnocl.core.scene.saturation.cosmic_rays", brightest)
+        scene = Scene(lnocl.Observation(image, PSF, background=LEVEL), np.array([STAR]))
+        assert rays_on_stars(scene, np.zeros((1, SIZE, SIZE), bool)).any() == (half == 0)
 
     def test_the_star_has_its_flux(self):
         image, rays = self.image()

@@ -13,6 +13,7 @@ from collections.abc import Iterable, Iterator
 from typing import NamedTuple
 
 import numpy as np
+from scipy.ndimage import binary_dilation, label
 
 from lnocl.core.scene.arrays import Array, Mask
 from lnocl.core.scene.blemishes import cosmic_rays
@@ -47,7 +48,7 @@ PARTS, FITTED = (0.9, 0.7, 0.5, 0.3, 0.2, 0.1, 0.05), 0.15
 
 # Rays on a star are looked for where the PSF is wider than this, pixels, and taken to be wrong by
 # this share of the model, from which so many fits leave out what is so many times that above it.
-SHARPEST, RAY_ERROR, CLIPS, CLIPPED = 2.2, 0.25, 4, 4.0
+SHARPEST, RAY_ERROR, CLIPS, CLIPPED = 2.2, 0.07, 4, 4.0
 
 
 class LostCore(NamedTuple):
@@ -136,6 +137,10 @@ def rays_on_stars(scene: Scene, known: Mask) -> Mask:
             masked = known[j, rows, columns]
             left[masked] = 0.0  # as beside the star, where nothing else is known
             found_there = cosmic_rays(left, noise, ~(core.good | masked), [psfs[j]])
+            # What is larger than the rays in it is what a wrong PSF leaves.
+            labels, _ = label(left > CLIPPED * noise, np.ones((3, 3)))
+            beyond = labels[~binary_dilation(found_there, np.ones((3, 3)))]
+            found_there &= ~np.isin(labels, beyond[beyond > 0])
             rays[j, rows, columns] |= found_there & ~masked
     return rays
 
