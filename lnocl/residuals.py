@@ -123,6 +123,8 @@ class StarResiduals(NamedTuple):
         The share of the star's flux that it may exchange with an extended source that is brightest
         under it, two standard errors (`lnocl.core.solvers.exchange`). It is 0 where that is not
         most of the error, or where PSFs are exact.
+    core_error : float
+        The relative error of the PSF in the core that would leave what the core has over noise.
 
     See Also
     --------
@@ -141,6 +143,7 @@ class StarResiduals(NamedTuple):
     halo: float
     halo_share: float
     exchanged: float = 0.0
+    core_error: float = 0.0
 
     @property
     def is_misfit(self) -> bool:
@@ -234,19 +237,21 @@ def judge_stars(estimate: Estimate) -> list[StarResiduals]:
     n = scene.n_stars
     stars = zip(scene.stars, on_pixels, estimate.star_fluxes[:n], scene.shown[:n], strict=True)
     for s, (position, on_pixel, flux, shown) in enumerate(stars):
-        core, wings = Fit(), Fit()
+        core, wings, counts = Fit(), Fit(), 0.0
         for j in np.flatnonzero(shown).tolist():
-            fits = _fits_at(estimate, j, psfs[scene.owned[s]][j], position)
-            core, wings = core.plus(fits[0]), wings.plus(fits[1])
+            of_core, of_wings, more = _fits_at(estimate, j, psfs[scene.owned[s]][j], position)
+            core, wings, counts = core.plus(of_core), wings.plus(of_wings), counts + more
+        excess = max(core.square_sum - 0.5 * core.variance, 0.0)
+        core_error = math.sqrt(excess / counts) if counts else 0.0
         halo, light = _halo(estimate.observed_sky, on_pixel, width)
         shown_flux = float(flux) * scene.share_shown(s)
-        shares = (halo / each if each > 0 else 0.0 for each in (shown_flux, light))
-        found.append(StarResiduals(core, wings, *shares))
+        halo, share = (halo / each if each > 0 else 0.0 for each in (shown_flux, light))
+        found.append(StarResiduals(core, wings, halo, share, core_error=core_error))
     return found
 
 
-def _fits_at(estimate: Estimate, j: int, psf: Array, position: Array) -> tuple[Fit, Fit]:
-    """Return the fit in the core and in the wings of a star in one image, whose PSF is given."""
+def _fits_at(estimate: Estimate, j: int, psf: Array, position: Array) -> tuple[Fit, Fit, float]:
+    """Return the fit in core and wings of a star in one image, and the electrons in its core."""
     from astropy.nddata import NoOverlapError, overlap_slices
 
     from lnocl.core.scene.view import View, Window  # which load scipy
@@ -268,7 +273,7 @@ def _fits_at(estimate: Estimate, j: int, psf: Array, position: Array) -> tuple[F
     try:
         there, of_psf = overlap_slices(observation.shape, bright.shape, middle)
     except NoOverlapError:  # the star is in other images alone
-        return Fit(), Fit()
+        return Fit(), Fit(), 0.0
     rows, columns = there
     shape = rows.stop - rows.start, columns.stop - columns.start
     window = Window(rows.start, columns.start, shape)
@@ -277,7 +282,8 @@ def _fits_at(estimate: Estimate, j: int, psf: Array, position: Array) -> tuple[F
     values = residuals(observation.images[j][there], observation.mask[j][there], model)
     share = bright[of_psf] / psf.max()
     is_core, is_wing = share > CORE, (share > WINGS) & (share <= CORE)
-    return Fit.of(values[is_core], model[is_core]), Fit.of(values[is_wing], model[is_wing])
+    of_core, of_wings = (Fit.of(values[where], model[where]) for where in (is_core, is_wing))
+    return of_core, of_wings, float(model[is_core & ~np.isnan(values)].sum())
 
 
 def _halo(extended: Array, position: Array, width: float) -> tuple[float, float]:

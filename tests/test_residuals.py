@@ -110,6 +110,9 @@ def test_pixels_are_those_of_the_images(known):
                     share = psf[at] / psf.max()
                     core[j, row, column] = share > CORE
                     wings[j, row, column] = WINGS < share <= CORE
+        excess = max(found.core.square_sum - found.core.variance / 2.0, 0.0)
+        error = np.sqrt(excess / models[core & good].sum())
+        np.testing.assert_allclose(found.core_error, error, rtol=1e-7)
         for fit, there in ((found.core, core & good), (found.wings, wings & good)):
             assert fit.n_pixels == there.sum() > 5
             np.testing.assert_allclose(fit.square_sum, squares[there].sum(), rtol=3e-6)
@@ -132,6 +135,7 @@ def test_a_misfit_is_found_where_it_is(known, wrong):
         wrong == "core",
         wrong == "wings",
     )
+    assert (at_stars[0].core_error > 0.1) == (wrong == "core")
     assert not at_stars[1].core.is_misfit
     assert not at_stars[1].wings.is_misfit
     assert judge(changed, models)[0].rms > 1.0

@@ -9,6 +9,7 @@ import numpy as np
 
 from lnocl.core.scene.arrays import Array
 from lnocl.core.scene.detector import on_sky
+from lnocl.core.scene.psfs import PSF_ERROR
 from lnocl.core.scene.star_psfs import owned
 from lnocl.core.scene.stars import MAX_SHIFT
 from lnocl.errors import MisfitWarning, counted, warn
@@ -50,13 +51,14 @@ def faults(result: Result) -> list[str]:
     """Return where the model does not fit and what to do, a line each; parameters by their names.
 
     They are those of stars without light, of stars that moved too far, and of residuals far from
-    what noise leaves; light all round a star, as a PSF that is too narrow leaves it; and light that
-    star and host may exchange.
+    what noise leaves, or the error of the PSF that the errors of fluxes hold; light all round a
+    star, as a PSF that is too narrow leaves it; and light that star and host may exchange.
     """
     findings, at_stars, overall = result._findings, result.star_residuals(), result.fit()
     labels = findings.observation.epoch_labels
     n_epochs = len(labels)
-    unfitted, lit, dark, lost, paired = (_Told(labels) for _ in range(5))
+    unfitted, held, lit, dark, lost, paired = (_Told(labels) for _ in range(6))
+    most = min(findings.observation.psf_error, PSF_ERROR)
     for s, (place, given, flux, found) in enumerate(
         zip(
             result.star_positions, findings.given_positions, result.star_fluxes, at_stars,
@@ -72,7 +74,10 @@ def faults(result: Result) -> list[str]:
         if np.hypot(*(place - given)) > AT_LIMIT * MAX_SHIFT:
             lost.add(s, in_words(given), f" to {in_words(place)}")
         if found.is_misfit:
-            unfitted.add(s, in_words(place))
+            if found.core_error < most and not found.wings.is_misfit:
+                held.add(s, in_words(place), share=found.core_error)
+            else:
+                unfitted.add(s, in_words(place))
         if found.has_halo:
             lit.add(s, in_words(place), share=found.halo)
         if found.is_like_host:
@@ -99,6 +104,11 @@ def faults(result: Result) -> list[str]:
             f"the model does not fit at {len(unfitted)} of "
             f"{counted(len(at_stars) // n_epochs, 'star')}, {unfitted.words(' ')}: {remedy}"
         )
+    elif held:
+        lines.append(
+            f"the PSF is off at {held.count()}, {held.words('; ')}: within its error, which the "
+            "errors of fluxes hold"
+        )
     elif overall.is_misfit and not (dark or lost):
         lines.append("the model does not fit: see to background, noise and gain")
     refinement = result.psf_refinement
@@ -111,9 +121,8 @@ def faults(result: Result) -> list[str]:
         )
     if lit:
         lines.append(
-            f"light lies all round {lit.count()}, as a share of its flux: {lit.words('; ')}: the "
-            "PSF is too narrow or lacks its wings, the background is too low, or a source lies "
-            "there"
+            f"light lies all round {lit.count()}, as a share of its flux: {lit.words('; ')}: a "
+            "host, or the PSF is too narrow or lacks its wings, or the background is too low"
         )
     if paired:
         lines.append(
@@ -125,8 +134,9 @@ def faults(result: Result) -> list[str]:
 
 
 def is_doubt(fault: str) -> bool:
-    """Return whether a fault may be none: light that a host has, or may exchange with its star."""
-    return fault.startswith("light lies all round") or " may exchange light with " in fault
+    """Return whether a fault may be none, or errors hold it, as light that a host may have."""
+    parts = "light lies all round", " may exchange light with ", ": within its error, which"
+    return any(part in fault for part in parts)
 
 
 class _Told:
@@ -164,7 +174,7 @@ class _Told:
 def in_words(place: Iterable[float]) -> str:
     """Return a place as messages have it."""
     x, y = place
-    return f"({x:.7g}, {y:.7g})"
+    return f"({round(x, 2):.7g}, {round(y, 2):.7g})"
 
 
 def _elsewhere(extended: Array, place: Array, finer: int) -> str:

@@ -83,6 +83,13 @@ def nameless(monkeypatch):
     monkeypatch.setattr("lnocl.core.scene.psf_faults.name_faults", lambda *_: "")
 
 
+def observed(*labels, psf_error=0.0):
+    """Return what a verdict asks of an observation."""
+    return SimpleNamespace(
+        n_epochs=len(labels), epoch_labels=labels, star_places=(), psf_error=psf_error
+    )
+
+
 def test_a_star_that_moved_as_far_as_stars_may_is_named_first(nameless):
     def at(*given):
         bad = StarResiduals(Fit(100, 900.0, 200.0), Fit(), 0.0, 0.0)
@@ -97,7 +104,7 @@ def test_a_star_that_moved_as_far_as_stars_may_is_named_first(nameless):
             _findings=SimpleNamespace(
                 given_positions=np.array([given]),
                 may_free_pixels=True,
-                observation=SimpleNamespace(n_epochs=1, epoch_labels=("0",), star_places=()),
+                observation=observed("0"),
             ),
         )
         return faults(result)
@@ -114,7 +121,7 @@ def test_a_star_counts_once_and_its_epochs_are_named(nameless):
     findings = SimpleNamespace(
         given_positions=places,
         may_free_pixels=False,
-        observation=SimpleNamespace(n_epochs=2, epoch_labels=("May", "June"), star_places=()),
+        observation=observed("May", "June"),
     )
     result = SimpleNamespace(
         star_positions=places, star_fluxes=np.array([5.0, np.nan, 6.0, 7.0]), psf_refinement=None,
@@ -132,23 +139,41 @@ def test_a_star_counts_once_and_its_epochs_are_named(nameless):
     assert [is_doubt(each) for each in (unfitted, lit, paired)] == [False, True, True]
 
 
-@pytest.mark.parametrize(("n_bad", "remedy"), [(1, "the PSF fits the others: see"), (2, "give a")])
-def test_one_misfit_of_several_stars_is_not_blamed_on_the_psf(nameless, n_bad, remedy):
-    bad = StarResiduals(Fit(100, 900.0, 200.0), Fit(), 0.0, 0.0)
+def of_four(n_bad, psf_error=0.0, core_error=0.02, wings=100.0):
+    """Return the faults of four stars, some of which do not fit."""
+    bad = StarResiduals(
+        Fit(100, 900.0, 200.0), Fit(100, wings, 200.0), 0.0, 0.0, core_error=core_error
+    )
     found = [bad] * n_bad + [StarResiduals(Fit(100, 100.0, 200.0), Fit(), 0.0, 0.0)] * (4 - n_bad)
     places = np.array([(10.0, 13.0), (20.0, 9.0), (5.0, 25.0), (14.0, 20.0)])
     findings = SimpleNamespace(
         given_positions=places,
         may_free_pixels=False,
-        observation=SimpleNamespace(n_epochs=1, epoch_labels=("0",), star_places=()),
+        observation=observed("0", psf_error=psf_error),
     )
     result = SimpleNamespace(
         star_positions=places, star_fluxes=np.full(4, 5.0), psf_refinement=None, smoothing=0.0,
         star_residuals=lambda: found, fit=Fit, _findings=findings,
     )  # fmt: skip
-    (line,) = faults(result)
+    return faults(result)
+
+
+@pytest.mark.parametrize(("n_bad", "remedy"), [(1, "the PSF fits the others: see"), (2, "give a")])
+def test_one_misfit_of_several_stars_is_not_blamed_on_the_psf(nameless, n_bad, remedy):
+    (line,) = of_four(n_bad)
     assert line.startswith(f"the model does not fit at {n_bad} of 4 stars, ")
     assert f": {remedy}" in line
+
+
+def test_a_misfit_within_the_error_of_psfs_is_a_doubt(nameless):
+    (line,) = of_four(2, psf_error=0.03)
+    assert line.startswith(
+        "the PSF is off at 2 stars, (10, 13), 2 %; (20, 9), 2 %: within its error"
+    )
+    assert is_doubt(line)
+    for wrong in ({"core_error": 0.04}, {"wings": 900.0}, {"core_error": 0.01, "psf_error": 0.009}):
+        (line,) = of_four(1, **{"psf_error": 0.3} | wrong)  # more than PSFs have
+        assert not is_doubt(line)
 
 
 @pytest.mark.parametrize("more", [[], ["--quiet"]])
