@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import re
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -48,11 +49,11 @@ def light_curves(
 
 def times(labels: Sequence[str]) -> NDArray[Any]:
     """Return the places of epochs on an axis: numbers, such as MJD, dates, or else 0, 1, 2 ..."""
-    for kind in (np.float64, "datetime64[s]"):
-        with contextlib.suppress(ValueError):
-            found = np.array(labels).astype(kind)
-            if not (found != found).any():
-                return found
+    are_dates = all(re.match(r"\d{4}-\d\d-\d\d", label) for label in labels)  # not 03-05
+    with contextlib.suppress(ValueError):
+        found = np.array(labels).astype("datetime64[s]" if are_dates else np.float64)
+        if not (found != found).any():
+            return found
     return np.arange(float(len(labels)))
 
 

@@ -154,6 +154,7 @@ def test_numbers_of_stars_are_read_on_any_colour():
         (["2025-03-01", "2025-03-02T12:00:00", "2025-04-01"], [20148.0, 20149.5, 20179.0], None),
         (["first", "second", "third"], [0.0, 1.0, 2.0], ["first", "second", "third"]),
         (["1", "nan", "3"], [0.0, 1.0, 2.0], ["1", "nan", "3"]),
+        (["03-03", "03-04", "03-07"], [0.0, 1.0, 2.0], ["03-03", "03-04", "03-07"]),
     ],
 )
 def test_light_curves_are_below(labels, places, shown):
