@@ -67,8 +67,9 @@ class Calibration(NamedTuple):
         Pixel about which the field turns, with `angle` (default: the middle, nx // 2, ny // 2).
     epoch : sequence of float or str
         Epochs of the images; stars, such as a quasar that varies, have a flux of their own in each.
-        Give the word each, where every image is an epoch; a keyword of their headers such as
-        DATE-OBS; or a label for each image (default: one epoch).
+        Give the word each, where every image is an epoch; the word night, where the images of a
+        night are one, by the dates in their headers; a keyword of these such as DATE-OBS; or a
+        label for each image (default: one epoch).
     oversample, effective_psfs, psf_centre, psf_error
         As for `Observation`.
     psf_errors : sequence of str

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from astropy.io import fits
@@ -20,6 +20,11 @@ from lnocl.io.names import parse_name
 from lnocl.io.selection import choose, describe, find, has_pixels, name_of, only
 from lnocl.process import ignored_notes, ignored_warnings
 
+if TYPE_CHECKING:
+    from astropy.time import Time
+
+# Keywords with the date of an image, and their formats.
+DATES = {"MJD-AVG": "mjd", "MJD-OBS": "mjd", "DATE-OBS": "fits"}
 # Beginnings of CTYPE3 of cubes whose planes are not of one sky: colours, energies, velocities,
 # polarisations.
 NOT_EXPOSURES = (
@@ -160,6 +165,19 @@ def read_keyword(path: str, header: fits.Header, keyword: str) -> str | float | 
     with ignored_warnings(), open_fits(parse_name(path).file) as file:
         primary = readable(next(file.hdus()).header)
     return primary.get(keyword)
+
+
+def date_of(path: str, header: fits.Header) -> Time | None:
+    """Return when an image was taken, by its header; None where that does not say."""
+    from astropy.time import Time  # which few files need
+
+    for keyword, kind in DATES.items():
+        value = read_keyword(path, header, keyword)
+        try:
+            return Time(value, format=kind, scale="utc")
+        except (TypeError, ValueError):
+            continue
+    return None
 
 
 def keyword_number(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import os
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from astropy.io import fits
@@ -18,10 +18,15 @@ from lnocl.errors import FileError, InputError, counted, detail, note, warn
 from lnocl.io import sky
 from lnocl.io.calibration import Calibration, Word
 from lnocl.io.fitsfile import open_fits, open_regular
-from lnocl.io.fitsread import Stack, keyword_number, read_keyword
+from lnocl.io.fitsread import Stack, date_of, keyword_number, read_keyword
+
+if TYPE_CHECKING:
+    from astropy.time import Time
 
 # Most that is read of a file of angles.
 MAX_BYTES = 2**27
+# The longest night, days.
+NIGHT = 0.5
 
 
 class Places(NamedTuple):
@@ -197,7 +202,7 @@ def read_epochs(stack: Stack, paths: Sequence[str], words: Sequence[Word]) -> li
     Raises
     ------
     InputError
-        There are too few or too many, or a header lacks the keyword.
+        There are too few or too many, or a header lacks the keyword, or a date.
     """
     p = len(stack.data)
     if not words:
@@ -214,10 +219,22 @@ def read_epochs(stack: Stack, paths: Sequence[str], words: Sequence[Word]) -> li
     labels = []
     for j in range(p):
         of_file = min(j, len(paths) - 1)  # a cube has one header
-        labels.append(read_keyword(paths[of_file], stack.headers[of_file], str(words[0])))
+        file = paths[of_file], stack.headers[of_file]
+        by_night = words[0] == "night"
+        labels.append(date_of(*file) if by_night else read_keyword(*file, str(words[0])))
         if labels[-1] is None:
             raise InputError(
-                f"{paths[of_file]} has no {words[0]} in its header; give `epoch` each, another "
-                "keyword, or a label for each image"
+                f"{paths[of_file]} has no {'date' if by_night else words[0]} in its header; give "
+                "`epoch` each, another keyword, or a label for each image"
             )
-    return [str(label) for label in labels]
+    return _nights(labels) if by_night else [str(label) for label in labels]
+
+
+def _nights(dates: list[Time]) -> list[str]:
+    """Return the date of the first image of each night: of those within half a day from it on."""
+    labels, first = [""] * len(dates), None
+    for j in np.argsort([date.mjd for date in dates]).tolist():
+        if first is None or dates[j].mjd > first.mjd + NIGHT:
+            first = dates[j]
+        labels[j] = first.strftime("%Y-%m-%d")
+    return labels

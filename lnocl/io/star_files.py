@@ -20,15 +20,13 @@ from lnocl.core.scene import star_tables
 from lnocl.core.scene.arrays import Array
 from lnocl.errors import FileError, InputError, LnoclError, counted, note, warn
 from lnocl.io.fitsfile import open_fits, open_regular
-from lnocl.io.fitsread import read_keyword
+from lnocl.io.fitsread import date_of
 from lnocl.io.packed import unpacked
 from lnocl.io.sky import celestial_wcs, has_celestial, to_pixels
 from lnocl.process import ignored_warnings
 
 # Positions by pixels and by the sky may differ by so many pixels, as catalogues round them.
 SAME_PLACE = 1.0
-# Keywords with the date of an image, and their formats.
-DATES = {"MJD-AVG": "mjd", "MJD-OBS": "mjd", "DATE-OBS": "fits"}
 # Most that is read of a table of stars: plain text takes up to a hundred times its size in memory,
 # and compressed files unpack to a thousand times theirs.
 MAX_ROWS, MAX_MEBIBYTES = 1_000_000, 128
@@ -66,7 +64,7 @@ def read_stars(path: str, header: fits.Header, image: str) -> Array:
     columns = star_tables.find_columns(table.colnames, star_tables.IN_PIXELS)
     of_sky, sky_columns = _coordinates(path, table)
     if of_sky is not None:
-        of_sky = _moved(path, of_sky, table, _date(header, image))
+        of_sky = _moved(path, of_sky, table, date_of(image, header))
     places: dict[str, Array] = {}  # by the names of their columns
     if columns is not None:
         places[" and ".join(columns[:2])] = star_tables.in_pixels(table, columns, path)
@@ -117,17 +115,6 @@ def _coordinates(path: str, table: Table) -> tuple[SkyCoord | None, tuple[str, .
     if (abs(dec) > 90).any():
         raise InputError(f"column {columns.second} of {path} has rows beyond 90 degrees")
     return SkyCoord(ra, dec, unit="deg"), columns[:2]
-
-
-def _date(header: fits.Header, image: str) -> Time | None:
-    """Return when an image was taken, by its header; None where that does not say."""
-    for keyword, kind in DATES.items():
-        value = read_keyword(image, header, keyword)
-        try:
-            return Time(value, format=kind, scale="utc")
-        except (TypeError, ValueError):
-            continue
-    return None
 
 
 def _moved(path: str, of_sky: SkyCoord, table: Table, date: Time | None) -> SkyCoord:

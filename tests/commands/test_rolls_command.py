@@ -10,6 +10,9 @@ from turned_scenes import gaussian
 
 import lnocl
 from lnocl.commands import cli
+from lnocl.errors import InputError
+from lnocl.io.fitsread import Stack
+from lnocl.io.places import read_epochs
 from lnocl.io.saved_results import read_result
 from lnocl.plotting.result import draw_result
 from lnocl.studies.figures import view_of
@@ -105,6 +108,17 @@ def test_epochs(frames, capsys):
     assert stars["epoch"].tolist() == [0, 1, 2]
     assert stars["flux"] == pytest.approx(2e4, rel=0.04)
     assert len(view_of(read_result("out.fits")).stars) == 1
+
+
+def test_images_of_a_night_are_one_epoch_with_the_date_of_its_first():
+    hours = (23, 27, 71.9, 60.1, 73)  # from the first of March on
+    headers = [fits.Header({"MJD-OBS": 61100 + hour / 24}) for hour in hours]
+    stack = Stack(np.zeros((5, 2, 2)), headers, [], [])
+    labels = read_epochs(stack, [f"{j}.fits" for j in range(5)], ["night"])
+    assert labels == ["2026-03-01", "2026-03-01", "2026-03-03", "2026-03-03", "2026-03-04"]
+    del headers[3]["MJD-OBS"]
+    with pytest.raises(InputError, match=r"3\.fits has no date in its header; give epoch each"):
+        read_epochs(stack, [f"{j}.fits" for j in range(5)], ["night"])
 
 
 @pytest.mark.exhaustive
