@@ -25,7 +25,7 @@ from lnocl.core.runs.thinning import split_counts
 from lnocl.core.scene.arrays import Array
 from lnocl.core.scene.estimate import Estimate
 from lnocl.core.scene.penalty import Penalty
-from lnocl.errors import InputError, detail, warn
+from lnocl.errors import InputError, detail, note, warn
 from lnocl.process import ignored_notes
 
 # The halves run to this multiple of the chosen iteration, so that the references are resolved.
@@ -140,15 +140,15 @@ class HeldOutCounts:
         return LEAST_RATIO * cast(_First, self._first).n_iter > self._n_iter
 
     def warn_of_no_end(self, instead: Penalty | None) -> None:
-        """Warn of that, and name the penalty of the run that is the result instead, if any."""
+        """Name the penalty of the run that is the result instead, or warn that there is none."""
         chosen = cast(_First, self._first).n_iter
         words = (
             f"held-out counts have chosen iteration {chosen} of {self._n_iter}, too near the end"
         )
         if instead is not None:
-            warn(
+            note(
                 f"{words}: the result has `smoothing` {instead.in_words()} instead, run until the "
-                "objective settled; PSF or noise may be wrong"
+                f"objective settled (`n_iter` {MORE * self._n_iter} lets them choose)"
             )
             return
         warn(
