@@ -257,6 +257,25 @@ def test_errors_hold_the_light_of_a_ring_thinner_than_a_pixel():
 
 
 @pytest.mark.exhaustive
+@pytest.mark.parametrize("what", ["level", "halo"])
+def test_what_a_level_or_halo_takes_of_a_drawn_sky_is_no_bias(what):
+    """A drawn sky is nowhere dark, and they take up what it has everywhere."""
+    from regions import CirclePixelRegion, PixCoord
+
+    y, x = np.indices((32, 32)) - 16.0
+    psf, halo = np.exp(-(x**2 + y**2) / 4)[8:25, 8:25], 1.0 / (1.0 + (x**2 + y**2) / 200.0)
+    image = np.random.default_rng(4).poisson(100.0 + 20.0 * halo * (what == "halo"))
+    given = {"background_error": 3.0} if what == "level" else {"halos": halo}
+    observation = lnocl.Observation(image, psf, background=100.0, psf_error=0, **given)
+    region = CirclePixelRegion(PixCoord(16, 16), 12)
+    result = lnocl.deconvolve(observation, engine="numpy", n_iter=10, stop=None)
+    found = result.bootstrap(20, regions=[region])
+    k = 0 if what == "halo" else -1
+    light = result.extended[(x**2 + y**2) < 144].sum()
+    assert abs(found.bias[k]) < 0.1 * light
+    assert found.standard_errors[-1] < 0.5 * light
+
+
 def test_shares_of_stars_are_their_light_in_each_region():
     outcome = solved(refine_positions=True)._outcome
     found = bootstrap.without_replicas(outcome, APERTURES, 7)

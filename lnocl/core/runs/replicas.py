@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from copy import copy
 from typing import NamedTuple, cast
 
 import numpy as np
 
-from lnocl.core.runs.outcome import Outcome
+from lnocl.core.runs.outcome import Outcome, marginalise
 from lnocl.core.runs.repeated import RerunWithCounts
 from lnocl.core.scene.arrays import Array
 from lnocl.core.scene.estimate import Estimate
@@ -17,6 +18,7 @@ from lnocl.core.scene.psf_field import Psfs, mapped
 from lnocl.core.scene.psf_pixels import PsfPixels
 from lnocl.core.scene.star_prior import StarPrior
 from lnocl.core.scene.texture import Texture, hidden_radii, resolution
+from lnocl.core.solvers.light import Light
 
 # Counts, shape (p, ny, nx), and a prior of the stars.
 Given = tuple[Array, StarPrior | None]
@@ -109,9 +111,9 @@ class Replicas:
             scene.n_images + 3
         )
         sky = self._texture.draw(np.random.default_rng(of_sky))
-        extended = Estimate.of_scaled(scene, sky, self._outcome.estimate.fluxes).observed_sky
-        drawn = Sky(extended, extended, self._outcome.star_fluxes, scene.stars)
+        estimate = Estimate.of_scaled(scene, sky, self._outcome.estimate.fluxes)
         models = list(self._means(self._model, sky))
+        drawn = Sky(estimate.observed_sky, *self._without_noise(estimate, models), scene.stars)
         counts = self._draw(models, of_images)
         prior, star_fluxes = scene.penalty.stars, self._outcome.star_fluxes
         prior = prior and prior.drawn(star_fluxes, np.random.default_rng(of_prior))
@@ -121,6 +123,21 @@ class Replicas:
         # The same noise: counts that are drawn of almost the same mean may be quite others.
         changed = [n + b - a for n, a, b in zip(counts, models, others, strict=True)]
         return drawn, (counts, prior), (np.maximum(changed, 0.0), prior)
+
+    def _without_noise(self, drawn: Estimate, models: Sequence[Array]) -> tuple[Array, Array]:
+        """Return light and fluxes of a drawn sky, beside levels and halos fitted to its means.
+
+        No pixel of an estimate is negative, so that a drawn sky is nowhere dark. Levels and halos
+        take up what it has everywhere, which real skies have not.
+        """
+        halos, levels = self._outcome.has_marginal_halos, self._outcome.has_levels
+        if not (halos or levels):
+            return drawn.observed_sky, drawn.star_fluxes
+        scene = copy(drawn.scene)
+        scene.observation = scene.observation.replace(images=models)
+        seen = Estimate(scene, drawn.sky, drawn.star_fluxes)
+        fitted = marginalise(seen, False, halos, levels)
+        return Light(fitted).sky(), fitted.star_fluxes
 
     def _find(self, given: Iterable[Given]) -> list[Sky]:
         """Return the reconstructions of observations with these counts and priors."""
