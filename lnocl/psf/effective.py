@@ -21,8 +21,9 @@ from lnocl.psf.repair import repair
 from lnocl.psf.scatter import of_one, of_several, width_error
 from lnocl.psf.steps import cut_square, measure_background, nearest_pixel
 
-# Rounds of fitting the stars and adding what is left of them to the PSF.
-ROUNDS = 20
+# Rounds of fitting the stars and adding what is left of them to the PSF, at least and at most; they
+# end where they change no flux by more than this share. A saturated star settles slowly.
+ROUNDS, MOST_ROUNDS, SETTLED = 20, 200, 3e-5
 # The first rounds take each pixel for the star nearest to it, so that no star is another's wings.
 FIRST_ROUNDS = 3
 # Outside its core, a star's pixel is a neighbour's where it exceeds another star's by this share,
@@ -209,7 +210,7 @@ class _Stars:
                 "no star shows the middle of the PSF: all are bad there; give other stars"
             )
         psf = np.zeros((side, side))
-        for done in range(ROUNDS):
+        for done in range(MOST_ROUNDS):
             own = self._nearest() if done < FIRST_ROUNDS else self._outside_others(psf)
             left, overlap = self._residual(psf, own)
             left /= np.maximum(overlap, self._fluxes.min())
@@ -219,7 +220,11 @@ class _Stars:
                 c * self._centred(left, s, own[s]) * used[s] for s, c in enumerate(self._fluxes)
             ]
             psf += np.divide(sum(steps), weight, out=np.zeros_like(psf), where=weight > 0)
+            before = self._fluxes.copy()
             self._fit(psf)
+            change = float(np.max(abs(self._fluxes / before - 1.0)))
+            if done + 1 >= ROUNDS and change < SETTLED:
+                break
             if done + 1 == ROUGH_ROUNDS and self._n_own > 2:
                 self._leave_rays(psf)
                 shown[: self._n_own] = self._shown()[: self._n_own]

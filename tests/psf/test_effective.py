@@ -146,6 +146,25 @@ def test_a_saturated_star_adds_wings_and_does_not_move_the_centre():
     assert abs(star.psf - expected).max() < 0.04 * expected.max()
 
 
+@pytest.mark.exhaustive
+def test_the_wings_of_a_saturated_star_settle():
+    """Its flux, and so their share of the light, settles after tens of rounds."""
+
+    def moffat(flux, x0, y0, side=96):
+        y, x = np.indices((side, side))
+        return 0.06 * flux * (1 + ((x - x0) ** 2 + 1.2 * (y - y0) ** 2) / 9) ** -3.0
+
+    places = np.array([(22.3, 25.2), (70.1, 24.4), (25.2, 72.3), (68.2, 70.1)])
+    mean = 120.0 + sum(map(moffat, (6e5, 4e5, 5e5, 9e6), *places.T))
+    expected, (y, x) = moffat(1.0, 16, 16, 33), np.indices((33, 33)) - 16
+    wings, off = (np.hypot(x, y) > 5) & (np.hypot(x, y) < 13), []
+    for seed in range(4):
+        counts = np.random.default_rng(seed).poisson(mean) / 2.0
+        psf = make_psf(np.minimum(counts, 65535), places, 33).psf
+        off.append(psf[wings].sum() / expected[wings].sum() * expected.sum() - 1.0)
+    assert abs(np.mean(off)) < 0.0015
+
+
 def test_cosmic_rays_beside_stars_and_in_a_core_are_left_out():
     rng = np.random.default_rng(6)
     frame = rng.poisson(100.0 + a_frame(3.4)).astype(float)
