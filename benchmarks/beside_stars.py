@@ -1,16 +1,17 @@
 """Companions that are found beside a star, and what speckles raise as alarms.
 
     python benchmarks/beside_stars.py companions|alarms [--seeds FIRST LAST]
-        [--psfs exact noisy] [--distances D ...] [--times T ...] [--speckles E ...]
-        [--output FILE.ecsv]
+        [--psfs exact noisy] [--distances D ...] [--times T ...] [--completeness P]
+        [--speckles E ...] [--output FILE.ecsv]
 
 A star of 1e6 electrons on a sky of 50, in 64 x 64 pixels, through a pupil with aberrations that
 are others for each seed; lambda / D is 2.8 pixels, and its FWHM 3. All is by default.
 
-companions  of T times the flux that is found with 90 %, as stated where there is none, at D FWHM;
-            the PSF is exact, or the image of a star twice as bright. The table has for each PSF,
-            distance and flux the share found within .7 resolutions, the median of flux over truth,
-            and the rms of errors over those stated; 0 in n where the limit is not a number
+companions  of T times the flux that is found with probability P, 0.9 by default, as stated where
+            there is none, at D FWHM; the PSF is exact, or the image of a star twice as bright. The
+            table has for each PSF, distance and flux the share found within .7 resolutions, the
+            median of flux over truth, and the rms of errors over those stated; 0 in n where the
+            limit is not a number
 alarms      detections where there is none; the PSF has other speckles, so that it is off by a share
             E in the L2 norm. The table has the alarms a field, beside those stated
 """
@@ -49,7 +50,7 @@ def companions(seed, given):
         true, star = pupil_psf(rng.normal(0, 0.15, 5), speckles(rng)), middle(rng, N)
         psf = true if kind == "exact" else rng.poisson(2 * STAR * true + SKY) - SKY
         alone = SKY + seen(N, true, star, [STAR])
-        limit = detections(rng.poisson(alone), psf, star).limit(0.9)
+        limit = detections(rng.poisson(alone), psf, star).limit(given.completeness)
         for distance in given.distances:
             for times in given.times:
                 turn = rng.uniform(0, 2 * np.pi)
@@ -113,6 +114,7 @@ def main():
     parser.add_argument("--psfs", nargs="+", choices=("exact", "noisy"), default=["exact", "noisy"])
     parser.add_argument("--distances", nargs="+", type=float, default=[1, 1.5, 2, 3, 4, 6])
     parser.add_argument("--times", nargs="+", type=float, default=[1, 3, 10, 30, 100])
+    parser.add_argument("--completeness", type=float, default=0.9)
     parser.add_argument("--speckles", nargs="+", type=float, default=[0.005, 0.01, 0.02, 0.05])
     parser.add_argument("--output", metavar="FILE.ecsv")
     given = parser.parse_args()

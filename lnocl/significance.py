@@ -164,8 +164,9 @@ class Significance:
             allowed for where it is: a point has to be three errors above what that may be. Near a
             star it has to be five, or the threshold, above all that PSFs may have wrong, and three
             above that and the extended source, as points are tried and fitted there
-            (`lnocl.core.solvers.companions`). Points that were found are part of the model, and a
-            source at one of them is not told from it.
+            (`lnocl.core.solvers.companions`). Between two and three resolutions the map finds more
+            and more of them, and limits pass to its own, by their logarithms. Points that were
+            found are part of the model, and a source at one of them is not told from it.
 
         Raises
         ------
@@ -188,10 +189,10 @@ class Significance:
         number_in("completeness", completeness, "between 0 and 1", lambda given: 0 < given < 1)
         found = self._beside_points
         fluxes = found.needed(self._at_threshold, completeness), self._flux_distinct_from_source
-        (tried, fitted), least = self._beside_psfs, max(self.threshold, SIGNIFICANT)
+        (tried, fitted, share), least = self._beside_psfs, max(self.threshold, SIGNIFICANT)
         beside = np.maximum(least * tried, CLEAR * fitted) + norm.ppf(completeness) * tried
-        ny, nx = self.signal_to_noise.shape
-        return np.asarray(np.maximum(np.maximum(*fluxes), beside)[:ny, :nx])
+        (ny, nx), of_map = self.signal_to_noise.shape, np.maximum(*fluxes)
+        return np.asarray((of_map * np.maximum(beside / of_map, 1.0) ** share)[:ny, :nx])
 
     def inject(
         self, n: int = 100, completeness: float = 0.5, seed: int = 0, progress: bool = False
@@ -310,9 +311,9 @@ class Significance:
 
     @cached_property
     def _beside_psfs(self) -> Array:
-        """Standard errors of points near stars, tried and fitted; 0 elsewhere, and of others."""
+        """Errors of points near stars, tried and fitted, and a share; 0 elsewhere and of others."""
         if self._map.width:
-            return np.zeros((2, *self._map.values.shape))
+            return np.zeros((3, *self._map.values.shape))
         estimate, raised = self._with_points, halo_errors(self._outcome.estimate).raised
         is_known = np.arange(estimate.scene.n_stars) < self._outcome.scene.n_stars
         return errors_beside(estimate, raised, is_known)

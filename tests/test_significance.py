@@ -252,17 +252,37 @@ def test_the_limit_of_a_half_is_about_the_threshold(found):
 
 
 def test_limits_near_a_star_are_five_psf_errors_or_more(found, monkeypatch):
-    """And, fitted, three above that and what the extended source may be."""
+    """And, fitted, three above that and what the extended source may be; where the map has a share.
+
+    With half of it they are the geometric mean of the map's and these.
+    """
     error, limits = np.zeros(found._map.values.shape), []
     error[20:24, 43:46] = 1e5
-    for tried, fitted in ((0, 0), (1, 0), (1, 1.5), (1, 3)):
-        errors = np.array([tried * error, fitted * error])
+    shares = (0, 0, 0), (1, 0, 1), (1, 1.5, 1), (1, 3, 1), (1, 3, 0.5), (1, 3, 0)
+    for tried, fitted, share in shares:
+        errors = np.array([tried * error, fitted * error, share * (error > 0)])
         monkeypatch.setattr("lnocl.significance.errors_beside", lambda *_, e=errors: e)
         limits.append(replace(found).limit(0.9))
     beside = error[:N, :N] > 0
-    for after, least in zip(limits[1:], (5, 5, 9), strict=True):
+    for after, least in zip(limits[1:4], (5, 5, 9), strict=True):
         np.testing.assert_allclose(after[beside], (least + 1.2815516) * 1e5)
         np.testing.assert_array_equal(after[~beside], limits[0][~beside])
+    np.testing.assert_allclose(limits[4] ** 2, limits[0] * limits[3])
+    np.testing.assert_array_equal(limits[5], limits[0])
+
+
+def test_limits_pass_to_those_of_the_map_towards_three_resolutions():
+    """They fell by 1.54 there."""
+    counts = np.random.default_rng(0).poisson(SKY + point(*STAR, 1e5)).astype(float)
+    observation = lnocl.Observation(counts, PSF, background=SKY, psf_error=0.03)
+    result = lnocl.deconvolve(observation, [STAR], stop=None, n_iter=20, engine="numpy")
+    found = result.significance()
+    of_map = found._beside_points.needed(found._at_threshold, 0.5)[:N, :N]
+    over, (rows, columns) = found.limit(0.5) / of_map, np.indices((N, N))
+    away = np.hypot(columns - STAR[0], rows - STAR[1]) / found.resolution
+    assert np.median(over[(away > 1.2) & (away < 1.8)]) > 1.05
+    assert (over[(away > 2.8) & (away <= 3.0)] < 1.1).all()
+    assert np.nanmax(over[away > 3.0]) == 1.0
 
 
 def test_a_jet_limits_points_on_it(found):

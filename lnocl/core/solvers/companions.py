@@ -41,6 +41,8 @@ MOST_POINTS = 3
 # Points are tried at these distances from a star, resolutions, so many to one at first: nearer ones
 # are part of it, and of those farther off a PSF takes no light (docs/validation/psf_error.md).
 NEAREST, FARTHEST, STEPS = 0.5, 3.0, 2.0
+# Over so many resolutions within the farthest, PSFs take ever less of a point: maps find more.
+FADING = 1.0
 # Standard errors that a point has where it is tried, and beside what the extended source may be
 # there, as of detections; each of its steps is so many pixels at most.
 SIGNIFICANT, CLEAR, MOVED, N_STEPS = 5.0, 3.0, 1.0, 2
@@ -120,9 +122,11 @@ def errors_beside(
 ) -> Array:
     """Return the standard errors of points beside the brightest stars, beside all PSFs' errors.
 
-    They are those where points are tried, and where they are fitted with their places and have to
-    stand against the extended source: typical ones of each distance from a star, electrons, of
-    shape (2, Ny, Nx) on the grid of the sky; 0 far off, and NaN where a point is part of a star.
+    They are those where points are tried, electrons, and those where points are fitted with their
+    places and have to stand against the extended source; the latter are over the former as is
+    typical of each distance from a star. A share follows that falls from 1 to 0 where PSFs take
+    ever less of a point's light. All have the shape (3, Ny, Nx) on the grid of the sky; 0 far off,
+    and NaN where a point is part of a star.
 
     Parameters
     ----------
@@ -134,35 +138,34 @@ def errors_beside(
         Which stars have points beside them.
     """
     estimate = _doubted(estimate)
-    scene, errors = estimate.scene, np.zeros((2, *estimate.scene.grid))
+    scene, errors = estimate.scene, np.zeros((3, *estimate.scene.grid))
     around = Surroundings(estimate, False, raised)
     if around.width < NARROWEST:
         return errors
     for star in brightest(estimate, is_meant):
         near = NearStar(around, star, FINISHED)
-        distance, is_tried = _places(around, near, star)
-        y, x = np.nonzero(is_tried)
-        found, profile = _points(near, estimate, (y, x))[1], []
+        distance = _places(around, near, star)[0]
+        y, x = np.nonzero((distance > NEAREST) & (distance <= FARTHEST))
+        tried, ratios = _points(near, estimate, (y, x))[1], []
         rows, columns = offsets_from(scene, star, near.window)
         rings = np.round(STEPS * distance[y, x])
         for k in np.unique(rings):
             ring = np.flatnonzero(rings == k)
-            i = ring[np.argsort(found[ring])[len(ring) // 2]]
+            i = ring[np.argsort(tried[ring])[len(ring) // 2]]
             place = scene.stars[star] + np.array([columns[x[i]], rows[y[i], 0]]) / scene.oversample
-            point = Companion(place, SIGNIFICANT * found[i] * scene.unit)
+            point = Companion(place, SIGNIFICANT * tried[i] * scene.unit)
             beside = Surroundings(holding(estimate, [point], around.width), True, raised)
             fitted = NearStar(beside, scene.n_stars, FINISHED)
             error = step_of(fitted, scene.n_stars, scene.n_epochs)[1]
             if np.isfinite(error):
-                profile.append((distance[y[i], x[i]], found[i], error))
-        if profile:
-            at, *logs = np.log(sorted(profile)).T
-            between = np.log(np.maximum(distance, NEAREST))
-            values = [np.exp(np.interp(between, at, each)) * scene.unit for each in logs]
-            for each, value in zip(errors, values, strict=True):
-                value = np.where(distance > FARTHEST, 0.0, value)
-                value[distance <= NEAREST] = np.nan
-                each[near.places(scene)] = np.maximum(each[near.places(scene)], value)
+                ratios.append((distance[y[i], x[i]], error / tried[i]))
+        if ratios:
+            ratio = np.interp(distance[y, x], *np.transpose(sorted(ratios)))
+            values = np.where(distance <= NEAREST, np.nan, np.zeros((3, *distance.shape)))
+            share = np.minimum((FARTHEST - distance[y, x]) / FADING, 1.0)
+            values[:, y, x] = scene.unit * tried, scene.unit * tried * ratio, share
+            there = (slice(None), *near.places(scene))
+            errors[there] = np.maximum(errors[there], values)
     return errors
 
 
