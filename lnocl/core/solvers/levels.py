@@ -34,7 +34,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, maximum_filter
 
-from lnocl.core.scene.arrays import Array
+from lnocl.core.scene.arrays import Array, together
 from lnocl.core.scene.counts import means
 from lnocl.core.scene.estimate import Estimate
 from lnocl.core.scene.forward_model import Model
@@ -189,11 +189,10 @@ def fit_levels(estimate: Estimate) -> Estimate:
 
 def with_levels(observation: Observation, change: Array) -> Observation:
     """Return an observation with other levels of its background, which stays 0 or more."""
-    background = observation.background
-    each = background if background.ndim == 3 else background[:, None, None]
     rows, columns = (np.arange(n) for n in observation.shape)
     added = np.einsum("ji,iyx->jyx", change, planes(observation, rows[:, None], columns))
-    return observation.replace(background=np.maximum(each + added, 0.0))
+    background = np.add(*together(observation.background, added))
+    return observation.replace(background=np.maximum(background, 0.0))
 
 
 def lights(scene: Scene, change: Array) -> Iterator[Array]:
