@@ -20,11 +20,13 @@ from lnocl.core.scene.arrays import (
     refuse_unless,
     stack,
     together,
+    unmasked,
     values_and_mask,
 )
 from lnocl.core.scene.geometry import read_geometry
 from lnocl.core.scene.halos import read_halos
 from lnocl.core.scene.psfs import MOST_PSF_ERROR, read_ideal_psfs, read_pixels, read_psfs
+from lnocl.core.scene.quantities import in_unit
 from lnocl.core.scene.star_psfs import read_star_places, read_star_psfs
 from lnocl.core.scene.transforms import of_one_shape, refuse_other_shapes, shapes_of
 from lnocl.core.scene.uncertainties import is_uncertainty, without_source
@@ -72,7 +74,7 @@ class Given:
     def _plain(self, name: str, value: Any, has_exposure: bool) -> Any:
         unit = FIELDS[name].unit if name in FIELDS else ""
         if unit == "s":
-            value = containers.seconds(1.0 if value is None else value)
+            value = in_unit(name, 1.0 if value is None else value, unit)
             values, masked = values_and_mask(name, value)
             if values.ndim > 1:
                 self._bad.append((values == 0) & ~masked)
@@ -127,10 +129,6 @@ def _oversample(_: Field, value: Any, held: Observation) -> int:
     if not (isinstance(value, (int, np.integer)) and value in OVERSAMPLES):
         raise InputError(f"`oversample` must be 1, 2 or 4; {value} was given")
     return int(value)
-
-
-def _flag(field: Field, value: Any, held: Observation) -> bool:
-    return flag(field.name, value)
 
 
 def _psf_error(field: Field, value: Any, held: Observation) -> float:
@@ -215,8 +213,7 @@ def _deviations(field: Field, value: Any, held: Observation) -> Array:
 def _epochs(_: Field, epochs: Any, held: Observation) -> NDArray[np.intp]:
     """Return the number of each image's epoch, in the order of the labels, which are held too."""
     n_images = held.n_images
-    labels, masked = values_and_mask("epochs", np.zeros(n_images) if epochs is None else epochs)
-    refuse_masked("epochs", masked)
+    labels = unmasked("epochs", np.zeros(n_images) if epochs is None else epochs)
     if labels.shape != (n_images,):
         raise InputError(
             f"`epochs` has shape {labels.shape}; give a label for each of the {n_images} images"
@@ -240,9 +237,7 @@ def _transmission(field: Field, value: Any, held: Observation) -> Array:
     """Return the share of the sky's light that each image gets, shape (p, Ny, Nx) or (0, 0, 0)."""
     if value is None:
         return np.zeros((0, 0, 0))
-    array, masked = values_and_mask(field.name, value)
-    refuse_masked(field.name, masked)
-    values = numbers(field.name, array, copy=False)
+    values = numbers(field.name, value, copy=False)
     if values.ndim == 2:
         values = np.broadcast_to(values, (held.n_images, *values.shape))
     if values.ndim != 3 or len(values) != held.n_images:
@@ -280,7 +275,7 @@ FIELDS = {
     field.name: field
     for field in (
         Field("oversample", _oversample),
-        Field("effective_psfs", _flag),
+        Field("effective_psfs", lambda field, value, _: flag(field.name, value)),
         Field("images", _images, "counts", "pixels", beyond=np.nan),
         Field("mask", _mask, "", "pixels", beyond=True),
         Field("exposure", _levels, "s", "pixels", in_bad=1.0, is_positive=True),
