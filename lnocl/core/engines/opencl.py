@@ -166,9 +166,8 @@ class OpenCLEngine:
 
     def _cross_windows(self) -> StarWindows:
         cutouts = self.scaling.cross_information if self.scaling is not None else []
-        return StarWindows(
-            self.layout, [[covered_box([cutout], self.scene.grid)] for cutout in cutouts], 1
-        )
+        boxes = [[covered_box(cutout, self.scene.grid)] for cutout in cutouts]
+        return StarWindows(self.layout, boxes, 1)
 
     def _bind(self, name: str, **others: object) -> Launch:
         scene, rows = self.scene, self._spacing * self.scene.observation.shape[0]

@@ -334,10 +334,10 @@ class Scene:
         self, positions: Array, part: tuple[slice, slice] | None = None
     ) -> list[list[MovablePsf | DetectorPsf]]:
         observation, fields = self.observation, self.observation.psf_fields
-        if not fields and part is None and self.transmission is None:
-            return [[psf] * len(positions) for psf in self._psfs]
         if not fields and self.transmission is None:
-            parts = self._movable([psf[part] for psf in self.scaled_psfs()])
+            parts = self._psfs
+            if part is not None:
+                parts = self._movable([psf[part] for psf in self.scaled_psfs()])
             return [[psf] * len(positions) for psf in parts]
         shares = self.gains[:, None] * self.transmitted(positions)
         psfs = [
@@ -536,7 +536,7 @@ class Scene:
     def star_box(self, j: int, s: int) -> Covered:
         """Return the rows and columns of the images' grid that star s may light in image j."""
         max_shift = self._max_shift if s < self.n_stars else 0.0
-        return covered_box([self.star_cutout(j, s)], self.image_grid, max_shift)
+        return covered_box(self.star_cutout(j, s), self.image_grid, max_shift)
 
     def observed(self, total_weight: Array) -> NDArray[np.bool_]:
         """Return where the extended source was observed, from ``sum_j A_j^T w_j``."""
