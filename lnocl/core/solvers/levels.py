@@ -111,7 +111,7 @@ class Levels:
         for j, (counts, light, stars, background, weights) in enumerate(arrays):
             if j not in self._places:
                 continue
-            shapes, at = self._shapes(j), self._places[j]
+            shapes, at = View(scene, j).levels, self._places[j]
             information[at[:3], at[:3]] += self._prior[j] ** -2
             seen = weights > 0
             if not seen.any():
@@ -136,10 +136,6 @@ class Levels:
         covariance = np.linalg.inv(information * unit * unit[:, None]) * unit * unit[:, None]
         return covariance @ moments, covariance
 
-    def _shapes(self, j: int) -> Array:
-        """Return what the levels of image j are the amounts of, on its grid, shape (3, ny, nx)."""
-        return View(self._scene, j).levels
-
     def variance(self, factors: Sequence[Array]) -> float:
         """Return what levels add to the variance of a sum of counts, scaled; it may be negative.
 
@@ -151,7 +147,7 @@ class Levels:
         beside = np.zeros(len(self._covariance))
         shares = np.zeros((self._scene.n_images, 3))
         for j, at in self._places.items():
-            shapes = self._shapes(j)
+            shapes = View(self._scene, j).levels
             shares[j] = np.einsum("iyx,yx->i", shapes, factors[j])
             if j in self._held:
                 dark, wings = self._held[j]
