@@ -103,9 +103,8 @@ class ReferenceEngine:
         if self.scaling is None:
             self._correct()
             self._scale()
-            self._ratio()
-            return
-        self._step()
+        else:
+            self._step()
         self._ratio()
         self._make_gradient()
 
