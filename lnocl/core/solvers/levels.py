@@ -75,28 +75,22 @@ class Levels:
     def __init__(self, estimate: Estimate, are_fitted: bool = True) -> None:
         self._scene = scene = estimate.scene
         self._prior = scene.observation.background_error / scene.scale
-        free, p = np.flatnonzero(self._prior).tolist(), scene.n_images
+        self._free = np.flatnonzero(self._prior)
         # The unknowns are three of each image, and the amount of the wings.
-        first = 3 * np.arange(len(free))
+        n = 3 * len(self._free)
         self._places = {
-            j: np.append(k + np.arange(3), 3 * len(free)) for k, j in zip(first, free, strict=True)
+            j: np.append(3 * k + np.arange(3), n) for k, j in enumerate(self._free.tolist())
         }
         self._held: dict[int, tuple[Array, Array]] = {}  # the dark pixels, and the wings
-        found, self._covariance = np.zeros(3 * len(free) + 1), self._given()
+        found, measured = np.zeros((2, n + 1))
+        measured[:n:3] = self._prior[self._free] ** 2
+        self._covariance = np.diag(measured)
         if are_fitted:
             found, self._covariance = self._fit(estimate.extended, estimate.fluxes)
         deviations = np.sqrt(np.diag(self._covariance))
-        self.change, self.errors = np.zeros((2, p, 3))
-        for j, at in self._places.items():
-            self.change[j] = scene.scale * found[at[:3]]
-            self.errors[j] = scene.scale * deviations[at[:3]]
-
-    def _given(self) -> Array:
-        """Return the covariance of levels as they were measured."""
-        variances = np.zeros(3 * len(self._places) + 1)
-        for j, at in self._places.items():
-            variances[at[0]] = self._prior[j] ** 2
-        return np.diag(variances)
+        self.change, self.errors = np.zeros((2, scene.n_images, 3))
+        self.change[self._free] = scene.scale * found[:n].reshape(-1, 3)
+        self.errors[self._free] = scene.scale * deviations[:n].reshape(-1, 3)
 
     def _fit(self, extended: Array, fluxes: Array) -> tuple[Array, Array]:
         """Return the unknowns near an estimate, scaled, and their covariance."""
@@ -162,10 +156,7 @@ class Levels:
         return np.asarray(laid @ self._covariance @ laid.T)
 
     def _laid(self, shares: Array) -> Array:
-        laid = np.zeros(len(self._covariance))
-        for j, at in self._places.items():
-            laid[at[:3]] = shares[j]
-        return laid
+        return np.append(shares[self._free], 0.0)  # nothing of the wings
 
 
 def fit_levels(estimate: Estimate) -> Estimate:
