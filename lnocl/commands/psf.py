@@ -123,8 +123,7 @@ OPTIONS = [
     ),
     options.PICTURE.but(help="picture of frame, PSFs and profiles"),
     options.OVERWRITE,
-    options.QUIET,
-    options.VERBOSE,
+    *options.HOW_MUCH_IS_SAID,
 ]
 
 
