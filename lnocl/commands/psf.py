@@ -130,9 +130,9 @@ OPTIONS = [
 def _run(arguments: argparse.Namespace) -> list[str]:
     if arguments.check:
         return _report(arguments)
+    _check_outputs(arguments)
     if arguments.modes is not None:
         return _make_modes(arguments)
-    _check_outputs(arguments)
 
     from lnocl import psf
     from lnocl.io import fitsread
@@ -227,7 +227,6 @@ def _joined(
 
 def _make_modes(arguments: argparse.Namespace) -> list[str]:
     """Make the mean of the PSFs of several frames, and say how they differ."""
-    _check_outputs(arguments)
     if arguments.plot is not None or len(arguments.rotate) > 1 or arguments.mask is not None:
         raise InputError(
             "--modes makes one PSF of all frames; leave --plot, --rotate and --mask out"
