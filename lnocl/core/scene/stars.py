@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from lnocl.core.scene import star_tables
 from lnocl.core.scene.arrays import Array, numbers
 from lnocl.core.scene.band_matrix import BandMatrix
-from lnocl.core.scene.detector import DetectorPsf
+from lnocl.core.scene.detector import Movable
 from lnocl.core.scene.observation import Observation
-from lnocl.core.scene.shifting import MARGIN, Cutout, MovablePsf
+from lnocl.core.scene.shifting import MARGIN, Cutout
 from lnocl.errors import InputError
 
 # Pixels of a flattened array: a slice where they are all of it, which takes no gathering.
@@ -247,7 +247,7 @@ class StarField:
 
     def __init__(
         self,
-        psfs: Sequence[Sequence[MovablePsf | DetectorPsf]],
+        psfs: Sequence[Sequence[Movable]],
         observation: Observation,
         grid: tuple[int, int],
         positions: Array,
