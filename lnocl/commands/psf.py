@@ -21,7 +21,6 @@ from lnocl.errors import InputError, counted
 
 if TYPE_CHECKING:
     from astropy.io import fits
-    from matplotlib.figure import Figure
 
     from lnocl.io.fitswrite import Card
     from lnocl.psf.make import StarPsf
@@ -170,7 +169,12 @@ def _run(arguments: argparse.Namespace) -> list[str]:
         f"({k // 2}, {k // 2})"
     )
     if arguments.plot is not None:
-        lines.append(pictures.draw(arguments, _figure(arguments, stars)))
+        from lnocl.plotting.psf import draw_star_psf
+
+        star, each = stars[0], [star.psf for star in stars]
+        light = star.frame - star.background
+        drawn = draw_star_psf(light, star.bad, star.centres, each, arguments.rotate)
+        lines.append(pictures.draw(arguments, drawn))
     return lines
 
 
@@ -354,14 +358,6 @@ def _result_cards(stars: Sequence[StarPsf]) -> list[Card]:
             for j, star in enumerate(stars, 1)
         ),
     ]
-
-
-def _figure(arguments: argparse.Namespace, stars: Sequence[StarPsf]) -> Figure:
-    from lnocl.plotting.psf import draw_star_psf
-
-    first, psfs = stars[0], [star.psf for star in stars]
-    light = first.frame - first.background
-    return draw_star_psf(light, first.bad, first.centres, psfs, arguments.rotate)
 
 
 COMMAND = Command(
