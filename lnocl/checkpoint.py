@@ -188,7 +188,8 @@ class Checkpointer:
         resumed = None if source is None else read(source)
         self._may_replace = False
         if self._path is not None:
-            self._may_replace = _are_same(self._path, source)
+            if source is not None and os.path.exists(self._path):
+                self._may_replace = os.path.samefile(self._path, source)
             check_output(self._path, overwrite=True, is_updated=self._may_replace)
             self._path = os.path.abspath(self._path)  # wherever the process goes
             self._refuse_to_replace(self._path)
@@ -306,7 +307,3 @@ def _file_name(name: str, file: object) -> str | None:
     if not isinstance(file, (str, os.PathLike)) or not isinstance(os.fspath(file), str):
         raise InputError(f"`{name}` must be the name of a file; {file!r} was given")
     return cast(str, os.fspath(file))
-
-
-def _are_same(path: str, source: str | None) -> bool:
-    return source is not None and os.path.exists(path) and os.path.samefile(path, source)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import replace
 from functools import partial
+from inspect import signature
 from os import PathLike
 from typing import Literal
 
@@ -373,24 +374,8 @@ def deconvolve(
     (3, 'callback')
     """
     check_types(callback, progress=progress)
-    plan = make_plan(
-        observation,
-        stars,
-        mu=mu,
-        smoothing=smoothing,
-        solver=solver,
-        n_iter=n_iter,
-        stop=stop,
-        precision=precision,
-        engine=engine,
-        device=device,
-        pad=pad,
-        initial_extended=initial_extended,
-        initial_star_fluxes=initial_star_fluxes,
-        refine_positions=refine_positions,
-        refine_psfs=refine_psfs,
-        mend_images=mend_images,
-    )
+    planned = signature(make_plan).parameters
+    plan = make_plan(**{name: value for name, value in locals().items() if name in planned})
     prepared = prepare(plan, progress)
     inputs = partial(
         describe,

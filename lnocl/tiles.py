@@ -43,12 +43,8 @@ N_CHOOSING = 3
 # Warnings of tiles that are given in full.
 MAX_WARNINGS = 3
 
-TILE_DTYPE = np.dtype(
-    [
-        *((name, np.int64) for name in ("x", "y", "width", "height", "n_iter")),
-        ("objective", np.float64),
-    ]
-)
+WHOLE = "x", "y", "width", "height", "n_iter"
+TILE_DTYPE = np.dtype([*((name, np.int64) for name in WHOLE), ("objective", np.float64)])
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -179,7 +179,12 @@ def cut(
     moved = positions - (columns.start, rows.start)
     is_seen = part.shows(moved)
     if is_dark(part):
-        _refuse_own_psfs(part, moved[is_seen], tuple(each.core.start for each in spans))
+        if (owned(part, moved[is_seen]) >= 0).any():
+            y, x = (span.core.start for span in spans)
+            raise InputError(
+                f"the tile that begins at pixel ({x}, {y}) has a star with a PSF of its own, and "
+                "`transmission` is 0 all over it; give a larger `tile`"
+            )
         return None
     in_spans = [each.holds(at) for each, at in zip(spans, positions.T[::-1], strict=True)]
     is_own = np.all([is_seen, *in_spans], axis=0)
@@ -190,12 +195,3 @@ def cut(
         down, along = (range(q * at.start, q * at.stop) for at in (rows, columns))
         near_stars = part_of(near_stars, down, along).copy()
     return Tile(spans, boxes, part, moved[is_seen], own, np.flatnonzero(is_own), core, near_stars)
-
-
-def _refuse_own_psfs(part: Observation, stars: Array, first: tuple[int, ...]) -> None:
-    """Refuse stars with PSFs of their own, which are seen, where nothing else is transmitted."""
-    if (owned(part, stars) >= 0).any():
-        raise InputError(
-            "the tile that begins at pixel ({1}, {0}) has a star with a PSF of its own, and "
-            "`transmission` is 0 all over it; give a larger `tile`".format(*first)
-        )

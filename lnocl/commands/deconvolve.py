@@ -66,25 +66,17 @@ def solve(
                 "`parallel` does nothing without tiles: give `tile` too, or leave it out"
             )
         return deconvolve(frames.observation, **parameters, callback=callback)
-    return _solve_tiles(arguments, frames.observation, parameters)
+    for name in ("checkpoint", "resume"):
+        if parameters.pop(name, None) is not None:
+            raise InputError(f"`{name}` is not for tiles; leave it out")
+    how = {"tile": arguments.tile, "parallel": arguments.parallel}
+    return deconvolve_tiles(frames.observation, **how, **parameters)
 
 
 def in_tiles(arguments: argparse.Namespace, observation: Observation) -> bool:
     """Return whether a run is tile by tile, as is asked for, or as PSFs that vary may be."""
     varies = bool(observation.psf_fields)
     return arguments.tile is not None or (varies and for_the_whole(observation) is None)
-
-
-def _solve_tiles(
-    arguments: argparse.Namespace, observation: Observation, parameters: dict[str, Any]
-) -> Result:
-    """Run tile by tile; refuse what is for one run alone."""
-    for name in ("checkpoint", "resume"):
-        if parameters.pop(name, None) is not None:
-            raise InputError(f"`{name}` is not for tiles; leave it out")
-    return deconvolve_tiles(
-        observation, tile=arguments.tile, parallel=arguments.parallel, **parameters
-    )
 
 
 def _run(arguments: argparse.Namespace) -> Iterator[str]:

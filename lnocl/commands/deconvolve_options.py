@@ -53,8 +53,7 @@ OPTIONS = {
             help="picture of image, model, residuals and extended source, whole and at each star, "
             "and of how the iteration was chosen"
         ),
-        options.QUIET,
-        options.VERBOSE,
+        *options.HOW_MUCH_IS_SAID,
     ],
     "calibration": [
         BACKGROUND.but(

@@ -35,8 +35,7 @@ OPTIONS = [
     options.table_output("detections too", metavar="TABLE.ecsv"),
     options.PICTURE.but(help="picture of the map with the detections and their numbers"),
     options.OVERWRITE.but(help="replace TABLE and FILE.png if they exist"),
-    options.QUIET,
-    options.VERBOSE,
+    *options.HOW_MUCH_IS_SAID,
 ]
 
 

@@ -54,8 +54,7 @@ OPTIONS = [
     parameter(Result.bootstrap, "seed", metavar="S"),
     options.parallel("replicas"),
     options.OVERWRITE.but(help="begin anew, without the replicas that RESULT.fits has"),
-    options.QUIET,
-    options.VERBOSE,
+    *options.HOW_MUCH_IS_SAID,
 ]
 
 

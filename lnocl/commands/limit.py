@@ -50,8 +50,7 @@ OPTIONS = [
     options.table_output("curves too", metavar="TABLE.ecsv"),
     options.PICTURE.but(help="picture of the map of the limits and of their curves"),
     options.OVERWRITE.but(help="replace TABLE and FILE.png if they exist"),
-    options.QUIET,
-    options.VERBOSE,
+    *options.HOW_MUCH_IS_SAID,
 ]
 
 

@@ -356,6 +356,7 @@ VERBOSE = option(
     is_repeated=False,
     help="show what was measured and chosen too, as it happens",
 )
+HOW_MUCH_IS_SAID = QUIET, VERBOSE
 
 PICTURE = option("--plot", metavar="FILE.png", is_repeated=False)
 

@@ -21,7 +21,6 @@ from lnocl.errors import InputError, counted
 
 if TYPE_CHECKING:
     from astropy.io import fits
-    from matplotlib.figure import Figure
 
     from lnocl.io.fitswrite import Card
     from lnocl.psf.make import StarPsf
@@ -123,17 +122,16 @@ OPTIONS = [
     ),
     options.PICTURE.but(help="picture of frame, PSFs and profiles"),
     options.OVERWRITE,
-    options.QUIET,
-    options.VERBOSE,
+    *options.HOW_MUCH_IS_SAID,
 ]
 
 
 def _run(arguments: argparse.Namespace) -> list[str]:
     if arguments.check:
         return _report(arguments)
+    _check_outputs(arguments)
     if arguments.modes is not None:
         return _make_modes(arguments)
-    _check_outputs(arguments)
 
     from lnocl import psf
     from lnocl.io import fitsread
@@ -171,7 +169,12 @@ def _run(arguments: argparse.Namespace) -> list[str]:
         f"({k // 2}, {k // 2})"
     )
     if arguments.plot is not None:
-        lines.append(pictures.draw(arguments, _figure(arguments, stars)))
+        from lnocl.plotting.psf import draw_star_psf
+
+        star, each = stars[0], [star.psf for star in stars]
+        light = star.frame - star.background
+        drawn = draw_star_psf(light, star.bad, star.centres, each, arguments.rotate)
+        lines.append(pictures.draw(arguments, drawn))
     return lines
 
 
@@ -228,7 +231,6 @@ def _joined(
 
 def _make_modes(arguments: argparse.Namespace) -> list[str]:
     """Make the mean of the PSFs of several frames, and say how they differ."""
-    _check_outputs(arguments)
     if arguments.plot is not None or len(arguments.rotate) > 1 or arguments.mask is not None:
         raise InputError(
             "--modes makes one PSF of all frames; leave --plot, --rotate and --mask out"
@@ -356,14 +358,6 @@ def _result_cards(stars: Sequence[StarPsf]) -> list[Card]:
             for j, star in enumerate(stars, 1)
         ),
     ]
-
-
-def _figure(arguments: argparse.Namespace, stars: Sequence[StarPsf]) -> Figure:
-    from lnocl.plotting.psf import draw_star_psf
-
-    first, psfs = stars[0], [star.psf for star in stars]
-    light = first.frame - first.background
-    return draw_star_psf(light, first.bad, first.centres, psfs, arguments.rotate)
 
 
 COMMAND = Command(

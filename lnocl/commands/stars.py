@@ -46,8 +46,7 @@ OPTIONS = [
     SATURATION.but(help="pixels of this value and above are saturated, in the unit of the image"),
     options.PICTURE.but(help="picture of the image with the stars and their numbers"),
     options.OVERWRITE,
-    options.QUIET,
-    options.VERBOSE,
+    *options.HOW_MUCH_IS_SAID,
 ]
 
 

@@ -32,11 +32,6 @@ sys.stdout.buffer.write(pixels.tobytes())
 ASINH, POGSON = ("BSOFTEN", "BOFFSET"), 2.5 / math.log(10.0)
 
 
-def is_tiled(hdu: Any) -> bool:
-    """Return whether the pixels of an HDU are compressed in tiles, as fpack leaves them."""
-    return isinstance(hdu, fits.CompImageHDU)
-
-
 def unpacked(path: str, hdu: fits.CompImageHDU, content: IO[bytes]) -> NDArray[np.float64]:
     """Return the pixels of an image that is compressed in tiles.
 

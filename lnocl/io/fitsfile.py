@@ -17,7 +17,7 @@ from astropy.io import fits
 from numpy.typing import NDArray
 
 from lnocl.errors import FileError, LnoclError, warn
-from lnocl.io.encoded import is_tiled, unpacked, verify
+from lnocl.io.encoded import unpacked, verify
 from lnocl.io.packed import BLOCK, Blocks, check_sizes, copy_bytes, fits_content, place_of
 from lnocl.process import recorded_warnings
 
@@ -98,7 +98,7 @@ class FitsFile:
                 f"{self.path} has an image of shape {hdu.shape}, {needed / 2**30:.3g} GiB; "
                 f"this machine has {memory / 2**30:.3g} GiB of memory"
             )
-        if is_tiled(hdu):
+        if isinstance(hdu, fits.CompImageHDU):  # in tiles, as fpack leaves it
             return unpacked(self.path, hdu, self._content)
         self._verify(hdu)
         return np.array(hdu.data, dtype=np.float64)

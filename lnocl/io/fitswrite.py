@@ -100,9 +100,8 @@ def write_result(
     ]
     where = {SKY: of_sky, IMAGES: coordinates if is_shared else fits.Header(places)}
     hdus = [fits.PrimaryHDU(np.asarray(extended, np.float64), header)]
-    for name, content in {"STARS": of_stars, **parts}.items():
-        if content is not None:
-            hdus.append(hdu_of(name, content, where, unit))
+    contents = {"STARS": of_stars, **parts}.items()
+    hdus += [hdu_of(name, each, where, unit) for name, each in contents if each is not None]
     with whole_file(path, overwrite) as stream:
         fits.HDUList(hdus).writeto(stream, checksum=True)
 

@@ -12,11 +12,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from lnocl.core.scene.arrays import Array
+from lnocl.core.scene.arrays import Array, Mask
 from lnocl.core.scene.noise_check import noise_of
 from lnocl.errors import InputError, detail, note
-
-Mask = NDArray[np.bool_]
 
 # Counted electrons of fewer than this a pixel are whole numbers, most of them the same.
 FEW = 0.1

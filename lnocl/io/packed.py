@@ -78,18 +78,15 @@ def _copy(path: str, content: IO[bytes], copy: IO[bytes]) -> None:
         finally:
             copy.write(blocks.taken)
         check_sizes(path, header)
-        if not _has_room(header.data_size):
+        size = header.data_size
+        if size > IN_MEMORY and size >= shutil.disk_usage(tempfile.gettempdir()).free:
             raise FileError(
-                f"{path} has {header.data_size / 2**30:.3g} GiB of data by its header, for which "
+                f"{path} has {size / 2**30:.3g} GiB of data by its header, for which "
                 f"{tempfile.gettempdir()} has no room: name another folder by TMPDIR, or unpack it"
             )
-        if copy_bytes(content, copy, header.data_size + -header.data_size % BLOCK):
+        if copy_bytes(content, copy, size + -size % BLOCK):
             break
     content.read(PART)  # up to the checksum at the end
-
-
-def _has_room(size: int) -> bool:
-    return size <= IN_MEMORY or size < shutil.disk_usage(tempfile.gettempdir()).free
 
 
 def copy_bytes(source: IO[bytes], target: IO[bytes], size: int) -> int:

@@ -13,6 +13,7 @@ from astropy.io import fits
 
 from lnocl.core.scene.apertures import Aperture, Profile
 from lnocl.core.scene.observation import Observation
+from lnocl.core.scene.shifting import Cutout
 from lnocl.errors import FileError, InputError, installed, note
 from lnocl.io.fitsread import sky_header
 from lnocl.io.sky import celestial_wcs
@@ -257,7 +258,5 @@ def _aperture(found: _Found, shape: tuple[int, int]) -> Aperture:
         raise _outside(described, shape)
     if total == 0:
         raise InputError(f"{described} encloses no part of a pixel")
-    rows, columns = np.flatnonzero(weights.any(axis=1)), np.flatnonzero(weights.any(axis=0))
-    trimmed = weights[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
-    y, x = mask.bbox.iymin + int(rows[0]), mask.bbox.ixmin + int(columns[0])
-    return Aperture(name, y, x, trimmed)
+    trimmed = Cutout(weights, mask.bbox.iymin, mask.bbox.ixmin).trimmed(0.0)
+    return Aperture(name, trimmed.y, trimmed.x, trimmed.values)

@@ -65,9 +65,7 @@ def choose(path: str, hdus: Sequence[Any]) -> int | None:
     claims = science or others or images
     if claims[:1] == [0] and not science:
         claims = [i for i in claims if i == 0 or hdus[i].shape[-2:] != hdus[0].shape[-2:]]
-    if len(claims) > 1:
-        raise _ambiguous(path, hdus, claims)
-    return claims[0] if claims else None
+    return _one_of(path, hdus, claims)
 
 
 def find(name: ImageName, hdus: Sequence[Any]) -> int:
@@ -110,16 +108,17 @@ def only(path: str, hdus: Sequence[Any], name: str, version: int | None = None) 
         and name_of(hdu) == name
         and version in (None, hdu.header.get("EXTVER", 1))
     ]
-    if len(claims) > 1:
-        raise _ambiguous(path, hdus, claims)
-    return claims[0] if claims else None
+    return _one_of(path, hdus, claims)
 
 
-def _ambiguous(path: str, hdus: Sequence[Any], claims: Sequence[int]) -> InputError:
+def _one_of(path: str, hdus: Sequence[Any], claims: Sequence[int]) -> int | None:
+    """Return the one index of an image that may be meant, None of none; refuse several."""
+    if len(claims) < 2:
+        return claims[0] if claims else None
     named = [
         f"{describe(i, hdus[i])} of {' x '.join(map(str, hdus[i].shape))} pixels" for i in claims
     ]
-    return InputError(
+    raise InputError(
         f"{path} holds {len(claims)} images that may be meant: {', '.join(named)}; name the one to "
         f"use, as in '{path}[{_word(hdus, claims)}]'"
     )

@@ -16,6 +16,7 @@ from lnocl.core.scene.arrays import Array, Mask, flag, whole
 from lnocl.core.scene.psfs import PSF_ERROR
 from lnocl.core.scene.quantities import in_unit, split
 from lnocl.core.scene.shifting import MARGIN
+from lnocl.core.scene.transforms import enlarged
 from lnocl.detection.checks import read_image
 from lnocl.errors import InputError
 from lnocl.psf import checks, effective, resampling, steps
@@ -421,7 +422,7 @@ def make_psfs(
 
 def _turn_scatter(scatter: Array, side: int, angle: float) -> Array:
     turned = resampling.rotate(scatter, angle) if angle else scatter
-    return steps.middle_square(turned, side).clip(min=0.0)
+    return enlarged(turned, (side, side), is_centred=True).clip(min=0.0)
 
 
 class _Square(NamedTuple):
@@ -451,7 +452,8 @@ def _make_square(
         lines.append(line)
     psf, line = steps.crop_square(work, side, light, pixel, level)
     lines.append(line)
-    negative_shares = steps.negative_shares(steps.middle_square(before, side), psf)
+    before = enlarged(before, (side, side), is_centred=True)
+    negative_shares = steps.negative_shares(before, psf)
     psf, line = steps.count_negative(psf, clip_negative)
     flux = float(psf.sum())
     normalised = f"normalised: flux {flux:.6g} set to 1"

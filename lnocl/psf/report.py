@@ -118,6 +118,8 @@ class PsfReport(NamedTuple):
         refused = ", and is refused" if distance >= FAR_OFF_CENTRE else ""
         lit = self.border > MUCH_AT_BORDER
         is_level = lit and self.fall < BACKGROUND_FALL
+        # Noise grows with the pixels.
+        quiet = int(max(self.shape) * (MUCH_NOISE / max(self.noise, MUCH_NOISE)) ** 0.5)
         found = [
             (
                 distance >= LITTLE_OFF_CENTRE,
@@ -127,16 +129,12 @@ class PsfReport(NamedTuple):
             (self.negative > MUCH_NEGATIVE, f"many of its pixels are negative: {BETTER}"),
             (
                 self.noise > MUCH_NOISE,
-                f"its wings are noise: {BETTER}, or of {self._quiet_size()} pixels a side",
+                f"its wings are noise: {BETTER}, or of {quiet} pixels a side",
             ),
             (is_level, "its border is level: subtract a background, or make it larger"),
             (lit and not is_level, "its wings are cut off: make it larger"),
         ]
         return [sentence for is_so, sentence in found if is_so]
-
-    def _quiet_size(self) -> int:
-        """Return the side of a PSF with as much noise as may be, which grows with the pixels."""
-        return int(max(self.shape) * (MUCH_NOISE / max(self.noise, MUCH_NOISE)) ** 0.5)
 
 
 def examine(psf: ArrayLike) -> PsfReport:

@@ -13,6 +13,7 @@ import numpy as np
 from lnocl.core.scene.arrays import Array
 from lnocl.core.scene.rotation import turned_psf
 from lnocl.core.scene.shifting import place
+from lnocl.core.scene.transforms import enlarged
 
 
 def shift(image: Array, by: tuple[float, float]) -> Array:
@@ -57,8 +58,7 @@ def rotate(image: Array, angle: float) -> Array:
     if not rest:
         return turned
     wide = turned_psf(turned, -math.radians(rest))
-    part = slice(len(wide) // 2 - len(image) // 2, len(wide) // 2 - len(image) // 2 + len(image))
-    return wide[part, part]
+    return enlarged(wide, (len(image), len(image)), is_centred=True)
 
 
 def reach(side: int, angle: float) -> int:

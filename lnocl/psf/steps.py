@@ -15,6 +15,7 @@ from lnocl.core.scene.arrays import Array, Mask, numbers
 from lnocl.core.scene.blemishes import sharp_pixels
 from lnocl.core.scene.psf_edge import LEAST_RADIUS, psf_edge
 from lnocl.core.scene.shifting import ENDLESS, MARGIN, MovablePsf
+from lnocl.core.scene.transforms import enlarged
 from lnocl.detection.defects import are_counts, saturated_pixels, sharpest_psf
 from lnocl.detection.fitting import fit
 from lnocl.detection.maxima import SIGNIFICANT
@@ -337,12 +338,6 @@ def cut_square(array: NDArray, pixel: Pixel, half: int) -> NDArray:
     return np.pad(array[inside], missing, mode="symmetric")
 
 
-def middle_square(work: NDArray, side: int) -> NDArray:
-    """Return the square of this side around the middle of one of odd side."""
-    first = len(work) // 2 - side // 2
-    return work[first : first + side, first : first + side]
-
-
 def rotate_square(work: Array, angle: float, radius: int) -> tuple[Array, str]:
     """Rotate about the middle; the change of sharpness is measured within a radius."""
     turned = resampling.rotate(work, angle)
@@ -361,7 +356,7 @@ def crop_square(
     work: Array, side: int, light: Array, pixel: Pixel, level: float
 ) -> tuple[Array, str]:
     """Return the PSF; the line says which share of its light is outside it, as its edge tells."""
-    psf = middle_square(work, side).copy()
+    psf = enlarged(work, (side, side), is_centred=True).copy()
     flux = float(psf.sum())
     if not flux > 0:
         raise InputError(

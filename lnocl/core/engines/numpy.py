@@ -17,7 +17,7 @@ from lnocl.core.reference.smooth import smooth
 from lnocl.core.reference.step import gradient_rows, shortened, step_rows
 from lnocl.core.reference.transmit import gather_rows, transmit_rows
 from lnocl.core.reference.turn import irfft_sheared, ratio_sheared, unshear_columns
-from lnocl.core.scene.arrays import Array
+from lnocl.core.scene.arrays import Array, together
 from lnocl.core.scene.scene import Scene
 from lnocl.core.scene.steps import STUCK, Steps
 from lnocl.core.solvers.scaling import Scaling, inverse_weight
@@ -42,8 +42,7 @@ class ReferenceEngine:
             self.set_scaling(scaling)
         self.take_images()
         self._objectives: list[float] = []
-        background = scene.background()
-        self._background = background if background.ndim == 3 else background[:, None, None]
+        self._background, _ = together(scene.background(), self._images)
         self._otfs = np.array([otf_columns(rfft_rows(scene.psf(j))) for j in range(scene.n_images)])
         self._phases = None
         if rotations := scene.rotations:
@@ -104,9 +103,8 @@ class ReferenceEngine:
         if self.scaling is None:
             self._correct()
             self._scale()
-            self._ratio()
-            return
-        self._step()
+        else:
+            self._step()
         self._ratio()
         self._make_gradient()
 

@@ -10,15 +10,8 @@ import numpy as np
 import pyopencl as cl
 from numpy.typing import NDArray
 
+from lnocl.core.engines import needs
 from lnocl.core.engines.engine import State
-from lnocl.core.engines.needs import (
-    N_STEPS,
-    buffer_sizes,
-    cross_sizes,
-    has_background_map,
-    host_bytes,
-    scaling_sizes,
-)
 from lnocl.core.opencl.device import choose, context_of, describe, tell
 from lnocl.core.opencl.faults import guarded
 from lnocl.core.opencl.launch import Launch, Launcher
@@ -116,11 +109,11 @@ class OpenCLEngine:
             self._spacing,
         )
         self._cross = self._cross_windows()
-        sizes = buffer_sizes(scene, self.program, self.layout, self._stars, n_iter)
+        sizes = needs.buffer_sizes(scene, self.program, self.layout, self._stars, n_iter)
         if self._turned:
             sizes |= self._turned.sizes()
         if scaling is not None:
-            sizes |= scaling_sizes(scene, self.program, self.layout, self._cross)
+            sizes |= needs.scaling_sizes(scene, self.program, self.layout, self._cross)
         with_launcher = of_all(sizes | Launcher.sizes(self.program), n_members)
         n_engines = n_in_all // n_members
         self.bytes_needed = refuse_if_too_large(chosen, with_launcher, n_engines)
@@ -129,7 +122,7 @@ class OpenCLEngine:
             announce(
                 chosen,
                 n_engines * self.bytes_needed,
-                host_bytes(scene, scaling, of_device, self.program, n_in_all > 1),
+                needs.host_bytes(scene, scaling, of_device, self.program, n_in_all > 1),
                 describe_tuning(chosen, self.program.dtype, self.program.tuning),
             )
         self._launcher = Launcher(self.program, n_members)
@@ -166,9 +159,8 @@ class OpenCLEngine:
 
     def _cross_windows(self) -> StarWindows:
         cutouts = self.scaling.cross_information if self.scaling is not None else []
-        return StarWindows(
-            self.layout, [[covered_box([cutout], self.scene.grid)] for cutout in cutouts], 1
-        )
+        boxes = [[covered_box(cutout, self.scene.grid)] for cutout in cutouts]
+        return StarWindows(self.layout, boxes, 1)
 
     def _bind(self, name: str, **others: object) -> Launch:
         scene, rows = self.scene, self._spacing * self.scene.observation.shape[0]
@@ -181,7 +173,7 @@ class OpenCLEngine:
             "cross_columns": self._cross.n_columns,
             "has_skies": int(scene.transmission is not None),
             "has_weights": int(scene.weights is not None),
-            "has_background_map": int(has_background_map(scene)),
+            "has_background_map": int(needs.has_background_map(scene)),
             "has_exposure_map": int(scene.has_exposure_map),
             "mu": scene.mu,
             "is_smoothed": int(scene.is_smoothed),
@@ -271,7 +263,7 @@ class OpenCLEngine:
         """Measure steps with this from now on."""
         self.scaling = scaling
         self._cross = self._cross_windows()
-        self._memory.allocate(**cross_sizes(self.scene, self.program, self._cross))
+        self._memory.allocate(**needs.cross_sizes(self.scene, self.program, self._cross))
         self._upload_scaling(scaling)
 
     def _upload_scaling(self, scaling: Scaling) -> None:
@@ -386,7 +378,7 @@ class OpenCLEngine:
         if self._decided:
             return self._decided
         n = self._memory.n_members
-        numbers = self._memory.of(0).download("steps", n * N_STEPS).reshape(n, -1)
+        numbers = self._memory.of(0).download("steps", n * needs.N_STEPS).reshape(n, -1)
         for k, each in enumerate(numbers.tolist()):
             self._decided.append(Steps(*each))
             if self._decided[k].reason == STUCK:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple, TypeVar
 
 import pyopencl as cl
@@ -14,7 +14,7 @@ from lnocl.core.opencl import kernel_cache, sharing
 from lnocl.core.opencl.faults import after_fault, claim_process
 from lnocl.errors import DeviceError, InputError, note
 
-T = TypeVar("T")
+Named = TypeVar("Named", cl.Platform, cl.Device)
 
 # A number of threads that PoCL cannot have ends the process.
 THREADS, MAX_THREADS = "POCL_MAX_PTHREAD_COUNT", 4096
@@ -157,18 +157,18 @@ def _devices_of(platform: cl.Platform) -> list[cl.Device]:
 
 def _by_spec(spec: str, source: str) -> cl.Device:
     platform_part, _, device_part = spec.partition(":")
-    platform = _pick(_usable_platforms(), platform_part, lambda candidate: candidate.name)
+    platform = _pick(_usable_platforms(), platform_part)
     device = None
     if platform is not None:
-        device = _pick(_devices_of(platform), device_part or "0", lambda candidate: candidate.name)
+        device = _pick(_devices_of(platform), device_part or "0")
     if device is None:
         known = "; ".join(f"{spec_of(found)} for {describe(found)}" for found in find_devices())
         raise InputError(f"{source} {spec!r} fits no OpenCL device; give one of these: {known}")
     return device
 
 
-def _pick(candidates: Sequence[T], part: str, name: Callable[[T], str]) -> T | None:
+def _pick(candidates: Sequence[Named], part: str) -> Named | None:
     if part.isdecimal():
         return candidates[int(part)] if int(part) < len(candidates) else None
-    named = [found for found in candidates if part and part.lower() in name(found).lower()]
+    named = [found for found in candidates if part and part.lower() in found.name.lower()]
     return named[0] if named else None

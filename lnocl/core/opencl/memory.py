@@ -135,15 +135,13 @@ class Memory:
 
     def download(self, name: str, count: int) -> Array:
         """Return the first numbers in a buffer, as float64."""
-        values = np.empty(count, self._layout.dtype)
-        if count:
-            cl.enqueue_copy(self._queue, values, self.buffers[name], src_offset=self._part(name)[0])
-        return values.astype(np.float64)
+        return self.download_raw(name, count).astype(np.float64)
 
-    def download_raw(self, name: str) -> NDArray:
-        """Return all of a buffer as it lies on the device."""
-        values = np.empty(self.count(name), self._layout.dtype)
-        cl.enqueue_copy(self._queue, values, self.buffers[name], src_offset=self._part(name)[0])
+    def download_raw(self, name: str, count: int | None = None) -> NDArray:
+        """Return a buffer as it lies on the device, all of it or the first numbers."""
+        values = np.empty(self.count(name) if count is None else count, self._layout.dtype)
+        if values.size:
+            cl.enqueue_copy(self._queue, values, self.buffers[name], src_offset=self._part(name)[0])
         return values
 
     def upload_raw(self, name: str, values: NDArray) -> None:

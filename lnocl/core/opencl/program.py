@@ -29,6 +29,8 @@ from lnocl.process import LOCK, ignored_warnings
 # Groups a compute unit that have a scratch in global memory, where groups have several work-items.
 GROUPS_A_UNIT = 4
 
+# What kernels are told of a tuning.
+TUNED = "lanes", "block", "group", "chunk", "scratch_is_global", "scratch_blocks"
 # Pairs of rows in a piece of a column, where an image is sheared.
 COLUMN_PAIRS = 64
 
@@ -130,18 +132,13 @@ class Program:
         constants = {
             "REAL": "double" if dtype == np.float64 else "float",
             "BITS": "long" if dtype == np.float64 else "int",
-            "LANES": self.tuning.lanes,
-            "BLOCK": self.tuning.block,
-            "GROUP": self.tuning.group,
+            **{name.upper(): int(getattr(self.tuning, name)) for name in TUNED},
             **{
                 f"{name.upper()}_{part}": value
                 for name, each in self.radices.items()
                 for part, value in zip(("ODD", "OUTER", "LAST"), each, strict=True)
             },
-            "CHUNK": self.tuning.chunk,
             "IN_REGISTERS": int(self.tuning.points > 0),
-            "SCRATCH_IS_GLOBAL": int(self.tuning.scratch_is_global),
-            "SCRATCH_BLOCKS": self.tuning.scratch_blocks,
             "HAS_BUILTIN_PREFETCH": int(_has_builtin_prefetch(device)),
             "NX": grid[1],
             "NY": grid[0],

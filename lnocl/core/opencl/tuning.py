@@ -119,16 +119,10 @@ class Tuning:
         """Return the reals that a work-group's scratch takes: its block, or what it exchanges."""
         if self.points:
             return max(max(grid) * 17 // 16 * self.block, 2 * grid[0])
-        return 2 * self.block * self.scratch_points(grid, oversample, has_turns)
-
-    def scratch_points(
-        self, grid: tuple[int, int], oversample: int, has_turns: bool = False
-    ) -> int:
-        """Return the points of a block that a work-group holds while it transforms."""
         ny, nx = grid
         held = ny // oversample if self.scratch_blocks > 1 else 0
         rows = nx + (nx // oversample if oversample > 1 else 0)
-        return max(2 * (nx + TAPS) if has_turns else rows, ny + held)
+        return 2 * self.block * max(2 * (nx + TAPS) if has_turns else rows, ny + held)
 
 
 def line_items(grid: tuple[int, int], oversample: int, most: int) -> int:

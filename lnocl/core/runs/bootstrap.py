@@ -313,7 +313,12 @@ def bootstrap(
     ):
         bar.update(found.n)
         for each in chain.from_iterable(measured):
-            found = _with(found, each)
+            found = replace(
+                found,
+                errors=np.concatenate([found.errors, each.errors]),
+                of_psfs=np.concatenate([found.of_psfs, each.of_psfs]),
+                sums=found.sums + each.sums,
+            )
             bar.update()
             if look is not None and found.n > 1:
                 look(found)
@@ -404,16 +409,6 @@ class _Measuring:
         # There is light where the answer is brighter than the error.
         sums = np.array([smooth, smooth**2, self._smooth_answer > smooth])
         return _Measured((seen - drawn)[None], of_psfs, sums)
-
-
-def _with(found: Bootstrap, measured: _Measured) -> Bootstrap:
-    """Return the errors with those of one replica more."""
-    return replace(
-        found,
-        errors=np.concatenate([found.errors, measured.errors]),
-        of_psfs=np.concatenate([found.of_psfs, measured.of_psfs]),
-        sums=found.sums + measured.sums,
-    )
 
 
 def _refuse_other(earlier: Bootstrap, expected: Bootstrap) -> None:

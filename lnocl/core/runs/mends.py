@@ -9,7 +9,7 @@ import numpy as np
 from scipy.ndimage import binary_dilation
 
 from lnocl.core.runs.start import Setup
-from lnocl.core.scene.arrays import Array, Mask
+from lnocl.core.scene.arrays import Array, Mask, together
 from lnocl.core.scene.detector import psfs_on_detector
 from lnocl.core.scene.noise_check import measure_noise
 from lnocl.core.scene.observation import Observation
@@ -128,7 +128,6 @@ def fit_exposures(setup: Setup) -> tuple[Setup, str]:
     if found is None:
         return setup, ""
     factors, observation = np.exp(found.values), setup.observation
-    each = factors if observation.exposure.ndim == 1 else factors[:, None, None]
     words = "; ".join(
         f"`images[{j}]` {factor:.3f} +- {factor * error:.1g}"
         for j, (factor, error) in enumerate(zip(factors, found.errors, strict=True))
@@ -136,7 +135,7 @@ def fit_exposures(setup: Setup) -> tuple[Setup, str]:
     )
     words = f"times {words}, by {counted(found.n_stars, 'star')}"
     note(f"exposures fitted: {words} (`mend_images` False leaves them)")
-    changed = observation.replace(exposure=observation.exposure * each)
+    changed = observation.replace(exposure=np.multiply(*together(observation.exposure, factors)))
     return replace(setup, observation=changed, in_time=setup.is_rate), words
 
 

@@ -229,11 +229,9 @@ def read_smoothing(value: object) -> float | Literal["auto"]:
     InputError
         It is another word.
     """
-    if isinstance(value, str):
-        if value != "auto":
-            raise InputError(f"`smoothing` {value!r} is not known; give a number or auto")
-        return "auto"
-    return cast(float, value)
+    if isinstance(value, str) and value != "auto":
+        raise InputError(f"`smoothing` {value!r} is not known; give a number or auto")
+    return cast(float | Literal["auto"], value)
 
 
 def warn_of_rounding(n_iter: int) -> None:

@@ -6,18 +6,8 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal, NamedTuple
 
-from lnocl.core.runs.options import (
-    EngineName,
-    Precision,
-    StopName,
-    check_choices,
-    check_families,
-    check_length,
-    check_observation,
-    read_refine_positions,
-    read_smoothing,
-    read_start,
-)
+from lnocl.core.runs import options
+from lnocl.core.runs.options import EngineName, Precision, StopName
 from lnocl.core.runs.start import Setup
 from lnocl.core.scene.arrays import flag
 from lnocl.core.scene.observation import Observation
@@ -275,22 +265,22 @@ def plan(
     >>> lnocl.plan(obs).why_not("judge PSFs before the run")
     'there are no stars'
     """
-    check_observation(observation)
-    check_choices(solver, precision, engine, device)
-    check_length(n_iter, stop)
-    refine_positions = read_refine_positions(refine_positions)
+    options.check_observation(observation)
+    options.check_choices(solver, precision, engine, device)
+    options.check_length(n_iter, stop)
+    refine_positions = options.read_refine_positions(refine_positions)
     fits_stars = solver == "sgp" or refine_positions is True
     positions = check_positions(stars, observation)
     refuse_unowned(observation, positions)
     observation = observation.upright()
-    initial = read_start(observation, fits_stars, initial_extended, initial_star_fluxes)
-    smoothing = read_smoothing(smoothing)
+    initial = options.read_start(observation, fits_stars, initial_extended, initial_star_fluxes)
+    smoothing = options.read_smoothing(smoothing)
     Penalty(mu, 0.0 if isinstance(smoothing, str) else smoothing)  # refuses what is out of range
     setup = Setup(observation, positions, pad, solver, precision, engine, device, False, *initial)
     made = Plan(setup, mu, smoothing, int(n_iter), stop, mends=flag("mend_images", mend_images))
     is_auto = AUTO.holds(made) and made.does(PSFS)
     showing = positions[owned(observation, positions) < 0]
-    families = check_families(refine_psfs, observation, showing, refine_positions, is_auto)
+    families = options.check_families(refine_psfs, observation, showing, refine_positions, is_auto)
     moves = refine_positions if is_auto else refine_positions is True
     return replace(
         made,

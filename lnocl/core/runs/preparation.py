@@ -90,9 +90,7 @@ def prepare(plan: Plan, progress: bool = False) -> Prepared:
     penalties = _penalties(plan, mended, are_wrong)
     if are_wrong and stop == "held-out":  # which shares their error, and chooses too little
         stop = CONVERGED
-    steady, is_within = steady_penalty(penalties), is_auto and mended.is_within
-    refinement = mended.refinement
-    of_psfs = steady, refinement, is_within
+    of_psfs = steady_penalty(penalties), mended.refinement, is_auto and mended.is_within
     return Prepared(mended.setup, penalties, plan.n_iter, stop, *of_psfs, found)
 
 

@@ -15,6 +15,7 @@ from lnocl.core.scene.arrays import Array, Mask
 from lnocl.core.scene.cores import core
 from lnocl.core.scene.remembered import remembered
 from lnocl.core.scene.shifting import ENDLESS, MovablePsf
+from lnocl.core.scene.transforms import enlarged
 
 # The pairs of pixels on both sides of one: beside it, above and below, and across.
 DIRECTIONS = ((0, 1), (1, 0), (1, 1), (1, -1))
@@ -148,14 +149,11 @@ def _lobes(psf: Array, most: int) -> Array:
 
     Shape (n, n), at most `most` pixels to each side; each value is the largest of the next pixels.
     """
-    half = min(max(psf.shape) // 2 + 1, most)
-    whole = np.zeros((2 * max(psf.shape) + 3,) * 2)
-    first = whole.shape[0] // 2 - np.array(psf.shape) // 2
-    whole[first[0] : first[0] + psf.shape[0], first[1] : first[1] + psf.shape[1]] = psf / psf.max()
+    side, shown = 2 * max(psf.shape) + 3, 2 * min(max(psf.shape) // 2 + 1, most) + 1
+    whole = enlarged(psf / psf.max(), (side, side), is_centred=True)
     of_core = ndimage.binary_dilation(core(whole, CORE), np.ones((3, 3)))
     beyond = ndimage.maximum_filter(np.where(of_core, 0.0, whole), 3)[::-1, ::-1]
-    middle = whole.shape[0] // 2
-    return beyond[middle - half : middle + half + 1, middle - half : middle + half + 1]
+    return enlarged(beyond, (shown, shown), is_centred=True)
 
 
 def _pair(padded: NDArray[Any], at: NDArray[Any], direction: tuple[int, int]) -> NDArray[Any]:

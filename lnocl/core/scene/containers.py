@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from lnocl.core.scene.quantities import in_unit, is_nddata, split
+from lnocl.core.scene.quantities import is_nddata, split
 from lnocl.core.scene.uncertainties import is_uncertainty, variance_of
 from lnocl.core.scene.units import count_of
 from lnocl.errors import InputError
@@ -120,14 +120,3 @@ def _squared_counts(name: str, uncertainty: Any, are_rates: bool) -> tuple[Any, 
             f"the uncertainty of `{name}` is in {uncertainty.unit}; give it in counts, as `{name}`"
         )
     return variance, known[0] ** 2
-
-
-def seconds(values: Any) -> Any:
-    """Return exposures as plain numbers, times in seconds.
-
-    Raises
-    ------
-    InputError
-        A unit that is not a time.
-    """
-    return in_unit("exposure", values, "s")

@@ -16,7 +16,7 @@ from lnocl.core.scene.shifting import ENDLESS, Cutout, MovablePsf, movable_psf
 
 def movable_psfs(
     psfs: Iterable[Array], observation: Observation, grid: tuple[int, int]
-) -> list[MovablePsf | DetectorPsf]:
+) -> list[Movable]:
     """Return PSFs to be placed on the images' grid, as its pixels see them."""
     if observation.oversample == 1:
         return [movable_psf(psf, grid) for psf in psfs]
@@ -158,6 +158,10 @@ class DetectorPsf:
         q, (values, top, left) = self._q, cutout
         y, x = -(-top // q), -(-left // q)
         return Cutout(values[..., q * y - top :: q, q * x - left :: q], y, x)
+
+
+# What moves a PSF to a star: on pixels of the sky, or of larger ones.
+Movable = MovablePsf | DetectorPsf
 
 
 def _sum_ahead(values: Array, first: int, q: int, n: int, axis: int) -> tuple[int, Array]:

@@ -8,23 +8,12 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from lnocl.core.scene import containers
-from lnocl.core.scene.arrays import (
-    Array,
-    Mask,
-    booleans,
-    flag,
-    numbers,
-    pixels,
-    refuse_masked,
-    refuse_unless,
-    stack,
-    together,
-    values_and_mask,
-)
+from lnocl.core.scene import arrays, containers
+from lnocl.core.scene.arrays import Array, Mask
 from lnocl.core.scene.geometry import read_geometry
 from lnocl.core.scene.halos import read_halos
 from lnocl.core.scene.psfs import MOST_PSF_ERROR, read_ideal_psfs, read_pixels, read_psfs
+from lnocl.core.scene.quantities import in_unit
 from lnocl.core.scene.star_psfs import read_star_places, read_star_psfs
 from lnocl.core.scene.transforms import of_one_shape, refuse_other_shapes, shapes_of
 from lnocl.core.scene.uncertainties import is_uncertainty, without_source
@@ -72,8 +61,8 @@ class Given:
     def _plain(self, name: str, value: Any, has_exposure: bool) -> Any:
         unit = FIELDS[name].unit if name in FIELDS else ""
         if unit == "s":
-            value = containers.seconds(1.0 if value is None else value)
-            values, masked = values_and_mask(name, value)
+            value = in_unit(name, 1.0 if value is None else value, unit)
+            values, masked = arrays.values_and_mask(name, value)
             if values.ndim > 1:
                 self._bad.append((values == 0) & ~masked)
             return value
@@ -85,7 +74,7 @@ class Given:
         value, is_rate = containers.counts(name, value, has_exposure if unit == "counts" else None)
         self.rates |= {name} if is_rate else set()
         if name == "images":
-            value, masked = values_and_mask(name, value)
+            value, masked = arrays.values_and_mask(name, value)
             self._bad.append(masked)
         return value
 
@@ -129,12 +118,8 @@ def _oversample(_: Field, value: Any, held: Observation) -> int:
     return int(value)
 
 
-def _flag(field: Field, value: Any, held: Observation) -> bool:
-    return flag(field.name, value)
-
-
 def _psf_error(field: Field, value: Any, held: Observation) -> float:
-    error = numbers(field.name, value)
+    error = arrays.numbers(field.name, value)
     if error.ndim or not 0 <= error <= MOST_PSF_ERROR:
         raise InputError(
             f"`{field.name}` must be a number from 0 to {MOST_PSF_ERROR:g}, the standard error of "
@@ -144,13 +129,13 @@ def _psf_error(field: Field, value: Any, held: Observation) -> float:
 
 
 def _images(field: Field, value: Any, held: Observation) -> Array:
-    return stack(field.name, value, len(held.images) if "images" in vars(held) else 0)
+    return arrays.stack(field.name, value, len(held.images) if "images" in vars(held) else 0)
 
 
 def _mask(field: Field, given: tuple[Any, list[Mask]], held: Observation) -> Mask:
     """Return all bad pixels: those of `mask`, and those that other parameters show."""
     (value, others), shape = given, held.images.shape
-    mask = booleans(field.name, np.zeros(shape, bool) if value is None else value)
+    mask = arrays.booleans(field.name, np.zeros(shape, bool) if value is None else value)
     if mask.shape not in (shape, shape[1:]):
         raise InputError(f"`mask` has shape {mask.shape}; the images have {shape}")
     is_kept = value is not None and value is vars(held).get(field.name)
@@ -161,7 +146,7 @@ def _mask(field: Field, given: tuple[Any, list[Mask]], held: Observation) -> Mas
     not_finite = ~np.isfinite(held.images) & ~mask
     if n_not_finite := int(not_finite.sum()):
         mask = mask | not_finite
-        warn(pixels(n_not_finite, "image", "not finite", "masked"))
+        warn(arrays.pixels(n_not_finite, "image", "not finite", "masked"))
     refuse_all_bad(mask)
     return mask
 
@@ -178,12 +163,12 @@ def refuse_all_bad(mask: Mask) -> None:
 def _levels(field: Field, value: Any, held: Observation) -> Array:
     """Return one number for each image, or for each pixel: one map serves all images."""
     name, shape = field.name, held.images.shape
-    array, masked = values_and_mask(name, value)
+    array, masked = arrays.values_and_mask(name, value)
     if array.shape in (shape, shape[1:]):
         bad = held.mask if array.ndim == 3 else held.mask.all(axis=0)
         masked = masked & ~bad  # a new array: it may be the caller's
-    refuse_masked(name, masked)
-    values = numbers(name, array, copy=False)
+    arrays.refuse_masked(name, masked)
+    values = arrays.numbers(name, array, copy=False)
     if values.ndim > 1:
         if values.shape not in (shape, shape[1:]):
             raise InputError(f"`{name}` has shape {values.shape}; the images have {shape}")
@@ -199,24 +184,23 @@ def _levels(field: Field, value: Any, held: Observation) -> Array:
     else:
         values = np.array(np.broadcast_to(values, shape[:1]))
     if field.is_positive and values.ndim == 1:
-        refuse_unless(f"`{name}`", values, "finite and more than zero", values > 0)
+        arrays.refuse_unless(f"`{name}`", values, "finite and more than zero", values > 0)
     else:
-        refuse_unless(f"`{name}`", values, "finite and not negative", values >= 0)
+        arrays.refuse_unless(f"`{name}`", values, "finite and not negative", values >= 0)
     return values
 
 
 def _deviations(field: Field, value: Any, held: Observation) -> Array:
     values = _levels(field, value, held)
     with np.errstate(over="ignore"):
-        refuse_unless(f"the square of `{field.name}`", values**2, "finite", values >= 0)
+        arrays.refuse_unless(f"the square of `{field.name}`", values**2, "finite", values >= 0)
     return values
 
 
 def _epochs(_: Field, epochs: Any, held: Observation) -> NDArray[np.intp]:
     """Return the number of each image's epoch, in the order of the labels, which are held too."""
     n_images = held.n_images
-    labels, masked = values_and_mask("epochs", np.zeros(n_images) if epochs is None else epochs)
-    refuse_masked("epochs", masked)
+    labels = arrays.unmasked("epochs", np.zeros(n_images) if epochs is None else epochs)
     if labels.shape != (n_images,):
         raise InputError(
             f"`epochs` has shape {labels.shape}; give a label for each of the {n_images} images"
@@ -240,9 +224,7 @@ def _transmission(field: Field, value: Any, held: Observation) -> Array:
     """Return the share of the sky's light that each image gets, shape (p, Ny, Nx) or (0, 0, 0)."""
     if value is None:
         return np.zeros((0, 0, 0))
-    array, masked = values_and_mask(field.name, value)
-    refuse_masked(field.name, masked)
-    values = numbers(field.name, array, copy=False)
+    values = arrays.numbers(field.name, value, copy=False)
     if values.ndim == 2:
         values = np.broadcast_to(values, (held.n_images, *values.shape))
     if values.ndim != 3 or len(values) != held.n_images:
@@ -251,7 +233,7 @@ def _transmission(field: Field, value: Any, held: Observation) -> Array:
             f"each of the {held.n_images} images"
         )
     in_range = (values >= 0) & (values <= 1)
-    refuse_unless(f"`{field.name}`", values, "finite, zero or more, and at most 1", in_range)
+    arrays.refuse_unless(f"`{field.name}`", values, "finite, zero or more, and at most 1", in_range)
     if not values.any():
         raise InputError(f"`{field.name}` is 0 everywhere, so nothing of the sky is seen")
     return values
@@ -280,7 +262,7 @@ FIELDS = {
     field.name: field
     for field in (
         Field("oversample", _oversample),
-        Field("effective_psfs", _flag),
+        Field("effective_psfs", lambda field, value, _: arrays.flag(field.name, value)),
         Field("images", _images, "counts", "pixels", beyond=np.nan),
         Field("mask", _mask, "", "pixels", beyond=True),
         Field("exposure", _levels, "s", "pixels", in_bad=1.0, is_positive=True),
@@ -351,7 +333,7 @@ def hold(
     refuse_other_sky(held)
     with np.errstate(over="ignore", invalid="ignore"):  # bad pixels hold anything
         for name in given.rates:
-            rates, exposure = together(getattr(held, name), held.exposure)
+            rates, exposure = arrays.together(getattr(held, name), held.exposure)
             setattr(held, name, rates * exposure)
     return given
 
@@ -375,6 +357,6 @@ def noise_beyond_counts(held: Observation, given: Given) -> Array:
         )
     variances = np.asarray(given.variances).reshape(held.images.shape)
     if "images" in given.rates:
-        variances, exposure = together(variances, held.exposure)
+        variances, exposure = arrays.together(variances, held.exposure)
         variances = variances * exposure**2
     return without_source(variances, held.images, held.mask)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from lnocl.core.scene.arrays import Array, numbers
+from lnocl.core.scene.arrays import Array, numbers, refuse_unless
 from lnocl.core.scene.band_matrix import BandMatrix
 from lnocl.errors import InputError, warn
 
@@ -159,6 +159,5 @@ def _check(name: str, values: ArrayLike, shape: tuple[int, ...]) -> Array:
     array = numbers(name, values)
     if array.shape != shape:
         raise InputError(f"`{name}` has shape {array.shape}; it must have {shape}")
-    if not (np.isfinite(array).all() and (array >= 0).all()):
-        raise InputError(f"`{name}` must be finite and not negative")
+    refuse_unless(f"`{name}`", array, "finite and not negative", array >= 0)
     return array

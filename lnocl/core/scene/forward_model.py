@@ -9,7 +9,7 @@ from functools import cached_property
 
 import numpy as np
 
-from lnocl.core.scene.arrays import Array
+from lnocl.core.scene.arrays import Array, together
 from lnocl.core.scene.camera import (
     Camera,
     Ranges,
@@ -75,8 +75,7 @@ class Model:
         if not weights.strides[0]:  # all images share them
             weights = weights[:1]
         self.weights = np.broadcast_to(weights.astype(np.float64), self.shape)
-        background = scene.background()
-        self.background = background if background.ndim == 3 else background[:, None, None]
+        self.background, _ = together(scene.background(), self.weights)
 
     def with_background(self, scene: Scene, more: Sequence[Array]) -> Model:
         """Return the model of a scene with the same sky, and more background in each image."""

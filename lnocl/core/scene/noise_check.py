@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from lnocl.core.scene.arrays import Array, Mask
+from lnocl.core.scene.arrays import Array, Mask, together
 from lnocl.core.scene.observation import Observation
 from lnocl.core.scene.remembered import remembered
 from lnocl.errors import warn
@@ -113,9 +113,8 @@ def with_noise_shown(observation: Observation) -> Observation:
     if not shares.any():
         return observation
     background = observation.background
-    excess = background * shares.reshape(-1, *[1] * (background.ndim - 1))
-    each = excess if excess.ndim == 3 else excess[:, None, None]
-    images = (observation.images - each).clip(0.0)
+    excess = np.multiply(*together(background, shares))
+    images = np.subtract(*together(observation.images, excess)).clip(0.0)
     return observation.replace(images=images, background=background - excess)
 
 

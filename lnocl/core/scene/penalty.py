@@ -9,7 +9,7 @@ from typing import Any, cast
 
 import numpy as np
 
-from lnocl.core.scene.arrays import Array
+from lnocl.core.scene.arrays import Array, together
 from lnocl.core.scene.counts import mean_exposure
 from lnocl.core.scene.detector import psfs_on_detector
 from lnocl.core.scene.observation import Observation
@@ -90,11 +90,8 @@ def recommend_smoothing(observation: Observation) -> float:
     mean over the observed pixels, K_j as these see it.
     """
     relative = observation.exposure / mean_exposure(observation)
-    if relative.ndim == 1:
-        relative = relative[:, None, None]
-    variance = np.ma.masked_array(
-        relative**2 / np.maximum(observation.images, 1.0), observation.mask
-    ).mean(axis=(1, 2))
+    variances = np.divide(*together(relative**2, np.maximum(observation.images, 1.0)))
+    variance = np.ma.masked_array(variances, observation.mask).mean(axis=(1, 2))
     squares = (psfs_on_detector(observation) ** 2).sum(axis=(1, 2))
     return SMOOTHING * float(np.sqrt((variance * squares).sum()))
 

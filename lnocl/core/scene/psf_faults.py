@@ -91,8 +91,8 @@ def _stamps(observation: Observation, j: int, stars: Array, psf: Array) -> list[
         if min(first) < 0 or y + reach >= ny or x + reach >= nx:
             continue
         there = j, slice(y - reach, y + reach + 1), slice(x - reach, x + reach + 1)
-        counts, background = observation.images[there], observation.background
-        light = counts - (background[there] if background.ndim == 3 else background[j])
+        counts = observation.images[there]
+        light = counts - np.broadcast_to(observation.background[j], (ny, nx))[there[1:]]
         precision = ~observation.mask[there] / np.maximum(counts, 1.0)
         found.append(_Stamp(light, precision, (place[0] - first[1], place[1] - first[0])))
     return sorted(found, key=lambda stamp: -float(stamp.light.sum()))[:MOST_STARS]

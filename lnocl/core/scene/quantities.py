@@ -119,13 +119,13 @@ def _may_hold_units(values: Any) -> bool:
     return is_nddata(values) or (isinstance(values, Sequence) and not isinstance(values, str))
 
 
-def is_nddata(values: Any) -> bool:
-    """Return whether values are an NDData of astropy, such as a CCDData."""
-    if "astropy.nddata" not in sys.modules:
+def is_nddata(values: Any, kind: str = "NDData") -> bool:
+    """Return whether values are of a class of astropy.nddata, or one of it, such as a CCDData."""
+    if "astropy.nddata" not in sys.modules:  # then they cannot be
         return False
-    from astropy.nddata import NDData
+    from astropy import nddata
 
-    return isinstance(values, NDData)
+    return isinstance(values, getattr(nddata, kind))
 
 
 def coordinates(values: Any) -> list[Any]:

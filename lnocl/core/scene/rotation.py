@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from lnocl.core.scene.arrays import Array
 from lnocl.core.scene.line_weights import TAPS, LineSampling, shifted, undone, whole_and_weights
 from lnocl.core.scene.shifting import MARGIN
-from lnocl.core.scene.transforms import rotation
+from lnocl.core.scene.transforms import enlarged, rotation
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_array
@@ -210,9 +210,7 @@ def turned_psf(psf: Array, angle: float, scale: float = 1.0) -> Array:
     """
     psf = psf if scale == 1.0 else cropped(psf)
     n = STEP * math.ceil((math.hypot(*psf.shape) + 2 * MARGIN) / STEP)
-    laid = np.zeros((n, n))
-    y, x = (n // 2 - k // 2 for k in psf.shape)
-    laid[y : y + psf.shape[0], x : x + psf.shape[1]] = psf
+    laid = enlarged(psf, (n, n), is_centred=True)
     if scale != 1.0:
         laid, n = _finer(laid, scale), STEP * math.ceil(n * scale / STEP)
     places = np.arange(n) - n // 2

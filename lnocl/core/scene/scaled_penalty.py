@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 from lnocl.core.scene.arrays import Array
 from lnocl.core.scene.penalty import MAX_WEIGHT, Penalty
@@ -17,14 +17,8 @@ if TYPE_CHECKING:
 EDGE = 3.0
 
 
-class Scaled(NamedTuple):
-    """The attributes of the same names of `lnocl.core.scene.scene.Scene`."""
-
-    mu: float
-    smoothing: float
-    smoothing_map: Array | None
-    edge: float
-    star_prior: StarPrior | None
+# The attributes mu, smoothing, smoothing_map, edge and star_prior of a scene.
+Scaled = tuple[float, float, Array | None, float, StarPrior | None]
 
 
 def scaled(penalty: Penalty, scene: Scene) -> Scaled:
@@ -42,13 +36,9 @@ def scaled(penalty: Penalty, scene: Scene) -> Scaled:
         smoothing_map = smoothing + longer * enlarged(penalty.near_stars, scene.grid)
     if smoothing > 0 or smoothing_map is not None:
         edge = EDGE * scene.rough_fit.level if penalty.edge is None else penalty.edge / scene.unit
-    return Scaled(
-        _scaled("mu", penalty.mu, scene.scale * longer**2, scene),
-        smoothing,
-        smoothing_map,
-        edge,
-        penalty.stars and penalty.stars.scaled(scene.unit, scene.scale),
-    )
+    mu = _scaled("mu", penalty.mu, scene.scale * longer**2, scene)
+    star_prior = penalty.stars and penalty.stars.scaled(scene.unit, scene.scale)
+    return mu, smoothing, smoothing_map, edge, star_prior
 
 
 def _scaled(name: str, weight: float, factor: float, scene: Scene) -> float:

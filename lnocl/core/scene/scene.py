@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from lnocl.core.scene.arrays import Array, numbers
 from lnocl.core.scene.counts import mean_exposure
-from lnocl.core.scene.detector import DetectorPsf, movable_psfs, on_sky, psfs_with_pixels
+from lnocl.core.scene.detector import Movable, movable_psfs, on_sky, psfs_with_pixels
 from lnocl.core.scene.first_estimate import RoughFit, first_estimate, level_beside, rough_fit
 from lnocl.core.scene.grid import grid_of, pad_of
 from lnocl.core.scene.halos import halo_cutouts
@@ -323,7 +323,7 @@ class Scene:
 
     def star_psfs(
         self, positions: Array, part: tuple[slice, slice] | None = None
-    ) -> list[list[MovablePsf | DetectorPsf]]:
+    ) -> list[list[Movable]]:
         """Return the PSF of each image at each star's position, or a part of it, to be placed.
 
         PSFs of their own are whole.
@@ -332,12 +332,12 @@ class Scene:
 
     def _common_psfs(
         self, positions: Array, part: tuple[slice, slice] | None = None
-    ) -> list[list[MovablePsf | DetectorPsf]]:
+    ) -> list[list[Movable]]:
         observation, fields = self.observation, self.observation.psf_fields
-        if not fields and part is None and self.transmission is None:
-            return [[psf] * len(positions) for psf in self._psfs]
         if not fields and self.transmission is None:
-            parts = self._movable([psf[part] for psf in self.scaled_psfs()])
+            parts = self._psfs
+            if part is not None:
+                parts = self._movable([psf[part] for psf in self.scaled_psfs()])
             return [[psf] * len(positions) for psf in parts]
         shares = self.gains[:, None] * self.transmitted(positions)
         psfs = [
@@ -525,7 +525,7 @@ class Scene:
         """The stars where they are now."""
         return self._field
 
-    def _movable(self, psfs: Iterable[Array]) -> list[MovablePsf | DetectorPsf]:
+    def _movable(self, psfs: Iterable[Array]) -> list[Movable]:
         return movable_psfs(psfs, self.observation, self.image_grid)
 
     def scaled_psfs(self, psfs: Iterable[Array] | None = None) -> list[Array]:
@@ -536,7 +536,7 @@ class Scene:
     def star_box(self, j: int, s: int) -> Covered:
         """Return the rows and columns of the images' grid that star s may light in image j."""
         max_shift = self._max_shift if s < self.n_stars else 0.0
-        return covered_box([self.star_cutout(j, s)], self.image_grid, max_shift)
+        return covered_box(self.star_cutout(j, s), self.image_grid, max_shift)
 
     def observed(self, total_weight: Array) -> NDArray[np.bool_]:
         """Return where the extended source was observed, from ``sum_j A_j^T w_j``."""

@@ -6,9 +6,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from lnocl.core.scene.detector import DetectorPsf, on_sky
+from lnocl.core.scene.detector import Movable, on_sky
 from lnocl.core.scene.grid import psf_shape
-from lnocl.core.scene.shifting import MovablePsf
 from lnocl.errors import warn
 
 if TYPE_CHECKING:
@@ -24,7 +23,7 @@ MAX_RINGING = 0.01
 MAX_VARIATION = 0.2
 
 
-def warn_of_scene(scene: Scene, psfs: Sequence[MovablePsf | DetectorPsf], may_move: bool) -> None:
+def warn_of_scene(scene: Scene, psfs: Sequence[Movable], may_move: bool) -> None:
     """Warn of PSFs that are too large, vary or ring, and of offsets that go round the edges.
 
     Parameters
@@ -74,9 +73,7 @@ def _warn_of_wrapped_offsets(scene: Scene) -> None:
         )
 
 
-def _warn_of_ringing(
-    scene: Scene, psfs: Sequence[MovablePsf | DetectorPsf], may_move: bool
-) -> None:
+def _warn_of_ringing(scene: Scene, psfs: Sequence[Movable], may_move: bool) -> None:
     """Warn of PSFs that are moved between pixels and are sharper than pixels can hold."""
     observation, q = scene.observation, scene.oversample
     for j, offset in enumerate(observation.offsets):

@@ -16,7 +16,7 @@ from lnocl.core.scene.shifting import MovablePsf
 from lnocl.errors import InputError, counted
 
 if TYPE_CHECKING:
-    from lnocl.core.scene.detector import DetectorPsf
+    from lnocl.core.scene.detector import Movable
     from lnocl.core.scene.fields import Field
     from lnocl.core.scene.observation import Observation
 
@@ -112,7 +112,7 @@ class StarPsfs:
         self,
         observation: Observation,
         gains: Array,
-        movable: Callable[[Array], list[MovablePsf | DetectorPsf]],
+        movable: Callable[[Array], list[Movable]],
         grid: tuple[int, int],
     ) -> None:
         self._grid = grid
@@ -120,9 +120,7 @@ class StarPsfs:
         self._movable = [movable(each) for each in self._scaled]
         self.shares = observation.star_psfs.sum(axis=(2, 3))
 
-    def into(
-        self, psfs: list[list[MovablePsf | DetectorPsf]], owners: NDArray[np.intp]
-    ) -> list[list[MovablePsf | DetectorPsf]]:
+    def into(self, psfs: list[list[Movable]], owners: NDArray[np.intp]) -> list[list[Movable]]:
         """Put them into those of each image and star, for the stars that have them."""
         for s in np.flatnonzero(owners >= 0):
             for of_image, psf in zip(psfs, self._movable[owners[s]], strict=True):

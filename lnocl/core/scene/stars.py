@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from lnocl.core.scene import star_tables
 from lnocl.core.scene.arrays import Array, numbers
 from lnocl.core.scene.band_matrix import BandMatrix
-from lnocl.core.scene.detector import DetectorPsf
+from lnocl.core.scene.detector import Movable
 from lnocl.core.scene.observation import Observation
-from lnocl.core.scene.shifting import MARGIN, Cutout, MovablePsf
+from lnocl.core.scene.shifting import MARGIN, Cutout
 from lnocl.errors import InputError
 
 # Pixels of a flattened array: a slice where they are all of it, which takes no gathering.
@@ -123,8 +123,7 @@ class StarImages:
         """Yield squares of the grid, which stars have light there, and their images of it."""
         owners = [i for i, s in enumerate(stars) for _ in self._cores[s]]
         pieces = [piece for s in stars for piece in self._cores[s]]
-        shapes = np.array([piece.values.shape[1:] for piece in pieces]).reshape(-1, 2)
-        corners = np.array([piece[1:] for piece in pieces]).reshape(-1, 2)
+        corners, shapes = _corners_and_sizes(pieces)
         parts = [
             [
                 (slice(at, min(at + TILE, n)), _shared(corners[:, i], shapes[:, i], at, n))
@@ -147,6 +146,13 @@ class StarImages:
                         for to_x, from_x in columns_of[i]:
                             images[slot, : len(values), to_y, to_x] += values[:, from_y, from_x]
                 yield (rows, columns), stars[lighting], images
+
+
+def _corners_and_sizes(cutouts: Sequence[Cutout]) -> tuple[NDArray[np.int_], NDArray[np.int_]]:
+    """Return where n cutouts begin and their shapes, rows before columns, shape (n, 2) each."""
+    corners = [cutout[1:] for cutout in cutouts]
+    sizes = [cutout.values.shape[-2:] for cutout in cutouts]
+    return np.array(corners, int).reshape(-1, 2), np.array(sizes, int).reshape(-1, 2)
 
 
 def _shared(
@@ -195,8 +201,7 @@ def order_of(
     reach = np.zeros((n, 2))
     for j, (places_there, cutouts) in enumerate(images):
         scale = 1.0 if scales is None else scales[j]
-        first = np.array([cutout[1:] for cutout in cutouts]).reshape(n, 2)
-        size = np.array([cutout.values.shape for cutout in cutouts]).reshape(n, 2)
+        first, size = _corners_and_sizes(cutouts)
         away = places_there[:, ::-1] - first
         is_whole = size >= grid
         reach = np.maximum(reach, np.where(is_whole, grid, scale * np.maximum(away, size - away)))
@@ -242,7 +247,7 @@ class StarField:
 
     def __init__(
         self,
-        psfs: Sequence[Sequence[MovablePsf | DetectorPsf]],
+        psfs: Sequence[Sequence[Movable]],
         observation: Observation,
         grid: tuple[int, int],
         positions: Array,
@@ -318,13 +323,7 @@ class StarField:
     @cached_property
     def _windows(self) -> list[tuple[NDArray[np.int_], NDArray[np.int_]]]:
         """For each image the first pixels and the shapes of the cutouts, shape (n, 2) each."""
-        return [
-            (
-                np.array([cutout[1:] for cutout in cutouts]).reshape(-1, 2),
-                np.array([cutout.values.shape for cutout in cutouts]).reshape(-1, 2),
-            )
-            for cutouts in self.cutouts
-        ]
+        return [_corners_and_sizes(cutouts) for cutouts in self.cutouts]
 
     def images(self, j: int, covered: NDArray[np.bool_]) -> StarImages:
         """Return the P_js over these pixels, which must include all that cutouts of stars cover."""
@@ -374,17 +373,14 @@ class Covered(NamedTuple):
     columns: NDArray[np.bool_]
 
 
-def covered_box(
-    cutouts: Sequence[Cutout], grid: tuple[int, int], max_shift: float = 0.0
-) -> Covered:
-    """Return the rows and columns that cutouts cover where stars move by up to `max_shift`."""
+def covered_box(cutout: Cutout, grid: tuple[int, int], max_shift: float = 0.0) -> Covered:
+    """Return the rows and columns that a cutout covers that moves by up to `max_shift`."""
     box = Covered(*(np.zeros(n, bool) for n in grid))
     distance = int(np.ceil(max_shift)) + MARGIN + 1 if max_shift else 0
     steps = np.arange(-distance, distance + 1)
-    for cutout in cutouts:
-        for axis, at in enumerate((cutout.rows(grid), cutout.columns(grid))):
-            is_covered = (cutout.values != 0).any(axis=1 - axis) | (max_shift > 0)
-            box[axis][(at[is_covered, None] + steps) % grid[axis]] = True
+    for axis, at in enumerate((cutout.rows(grid), cutout.columns(grid))):
+        is_covered = (cutout.values != 0).any(axis=1 - axis) | (max_shift > 0)
+        box[axis][(at[is_covered, None] + steps) % grid[axis]] = True
     return box
 
 

@@ -175,13 +175,11 @@ class Orientation(NamedTuple):
         """Return the nearest quarter turn or flip, and the remaining rotation, radians."""
         # Of both that leave half a right angle, the first.
         quarter = max(QUARTERS, key=lambda each: round(float((each * linear).sum()), 9))
-        left = quarter.T @ linear
         back = quarter.T
-        swaps = bool(back[0, 0] == 0)
-        signs = back.sum(axis=1)
-        return cls(swaps, (bool(signs[1] < 0), bool(signs[0] < 0))), float(
-            np.arctan2(left[1, 0], left[0, 0])
-        )
+        left = back @ linear
+        x_sign, y_sign = back.sum(axis=1)
+        nearest = cls(bool(back[0, 0] == 0), (bool(y_sign < 0), bool(x_sign < 0)))
+        return nearest, float(np.arctan2(left[1, 0], left[0, 0]))
 
     def of(self, array: NDArray[Any]) -> NDArray[Any]:
         """Return a view of an array whose last axes are (y, x)."""

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import sys
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lnocl.core.scene.arrays import Array, numbers
+from lnocl.core.scene.quantities import is_nddata
 from lnocl.errors import InputError, counted, detail
 
 # A gain that follows from the errors leaves them below the noise of the counts by so much.
@@ -21,11 +21,7 @@ class OtherNoiseError(InputError):
 
 def is_uncertainty(values: Any) -> bool:
     """Return whether values are an uncertainty of astropy.nddata."""
-    if "astropy.nddata" not in sys.modules:  # then they cannot be
-        return False
-    from astropy.nddata import NDUncertainty
-
-    return isinstance(values, NDUncertainty)
+    return is_nddata(values, "NDUncertainty")
 
 
 def variance_of(name: str, uncertainty: Any) -> tuple[Array, Any]:

@@ -159,8 +159,7 @@ def _of_star(scene: Scene, j: int, s: int, radius: float, unit: float) -> tuple[
     )
     there, first = (j, rows, columns), (rows.start, columns.start)
     counts, good = observation.images[there], ~observation.mask[there]
-    background = observation.background
-    light = counts - (background[there] if background.ndim == 3 else background[j])
+    light = counts - np.broadcast_to(observation.background[j], (ny, nx))[rows, columns]
     star = scene.star_cutout(j, s).add_to(np.zeros(good.shape), first, scene.image_grid)
     if observation.exposure.ndim == 3:
         star = star * observation.exposure[there]

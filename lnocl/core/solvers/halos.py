@@ -95,10 +95,6 @@ class _Joint:
         self.halos = slice(self.first, sources.n)
         self.fit = LeastSquares(images, [source], prior, N_STEPS, FINISHED)
 
-    def change(self) -> Array:
-        """Return the changes of the halos to where they are least, scaled."""
-        return self.fit.solve()[0][self.halos]
-
 
 def _like_halos(scene: Scene, precisions: list[Array]) -> NDArray[np.int_]:
     """Return the stars of which halos share most of the information that images have of each."""
@@ -136,7 +132,7 @@ def marginal_halos(estimate: Estimate) -> Estimate:
         information = np.diag(joint.fit.information)[joint.halos]
         # What a star or another halo can stand in for stays.
         is_told = np.isfinite(variances(joint.fit.information))[joint.halos]
-        change = np.where(is_told, joint.change(), 0.0)
+        change = np.where(is_told, joint.fit.solve()[0][joint.halos], 0.0)
         change = np.append(dark, np.maximum(change, -estimate.fluxes[scene.n_stars :]))
         sky = without(estimate, model, model.starlight(change))
         estimate = Estimate(scene, sky, estimate.star_fluxes + change * scene.unit)

@@ -34,7 +34,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter, maximum_filter
 
-from lnocl.core.scene.arrays import Array
+from lnocl.core.scene.arrays import Array, together
 from lnocl.core.scene.counts import means
 from lnocl.core.scene.estimate import Estimate
 from lnocl.core.scene.forward_model import Model
@@ -75,28 +75,22 @@ class Levels:
     def __init__(self, estimate: Estimate, are_fitted: bool = True) -> None:
         self._scene = scene = estimate.scene
         self._prior = scene.observation.background_error / scene.scale
-        free, p = np.flatnonzero(self._prior).tolist(), scene.n_images
+        self._free = np.flatnonzero(self._prior)
         # The unknowns are three of each image, and the amount of the wings.
-        first = 3 * np.arange(len(free))
+        n = 3 * len(self._free)
         self._places = {
-            j: np.append(k + np.arange(3), 3 * len(free)) for k, j in zip(first, free, strict=True)
+            j: np.append(3 * k + np.arange(3), n) for k, j in enumerate(self._free.tolist())
         }
         self._held: dict[int, tuple[Array, Array]] = {}  # the dark pixels, and the wings
-        found, self._covariance = np.zeros(3 * len(free) + 1), self._given()
+        found, measured = np.zeros((2, n + 1))
+        measured[:n:3] = self._prior[self._free] ** 2
+        self._covariance = np.diag(measured)
         if are_fitted:
             found, self._covariance = self._fit(estimate.extended, estimate.fluxes)
         deviations = np.sqrt(np.diag(self._covariance))
-        self.change, self.errors = np.zeros((2, p, 3))
-        for j, at in self._places.items():
-            self.change[j] = scene.scale * found[at[:3]]
-            self.errors[j] = scene.scale * deviations[at[:3]]
-
-    def _given(self) -> Array:
-        """Return the covariance of levels as they were measured."""
-        variances = np.zeros(3 * len(self._places) + 1)
-        for j, at in self._places.items():
-            variances[at[0]] = self._prior[j] ** 2
-        return np.diag(variances)
+        self.change, self.errors = np.zeros((2, scene.n_images, 3))
+        self.change[self._free] = scene.scale * found[:n].reshape(-1, 3)
+        self.errors[self._free] = scene.scale * deviations[:n].reshape(-1, 3)
 
     def _fit(self, extended: Array, fluxes: Array) -> tuple[Array, Array]:
         """Return the unknowns near an estimate, scaled, and their covariance."""
@@ -111,7 +105,7 @@ class Levels:
         for j, (counts, light, stars, background, weights) in enumerate(arrays):
             if j not in self._places:
                 continue
-            shapes, at = self._shapes(j), self._places[j]
+            shapes, at = View(scene, j).levels, self._places[j]
             information[at[:3], at[:3]] += self._prior[j] ** -2
             seen = weights > 0
             if not seen.any():
@@ -136,10 +130,6 @@ class Levels:
         covariance = np.linalg.inv(information * unit * unit[:, None]) * unit * unit[:, None]
         return covariance @ moments, covariance
 
-    def _shapes(self, j: int) -> Array:
-        """Return what the levels of image j are the amounts of, on its grid, shape (3, ny, nx)."""
-        return View(self._scene, j).levels
-
     def variance(self, factors: Sequence[Array]) -> float:
         """Return what levels add to the variance of a sum of counts, scaled; it may be negative.
 
@@ -151,7 +141,7 @@ class Levels:
         beside = np.zeros(len(self._covariance))
         shares = np.zeros((self._scene.n_images, 3))
         for j, at in self._places.items():
-            shapes = self._shapes(j)
+            shapes = View(self._scene, j).levels
             shares[j] = np.einsum("iyx,yx->i", shapes, factors[j])
             if j in self._held:
                 dark, wings = self._held[j]
@@ -166,10 +156,7 @@ class Levels:
         return np.asarray(laid @ self._covariance @ laid.T)
 
     def _laid(self, shares: Array) -> Array:
-        laid = np.zeros(len(self._covariance))
-        for j, at in self._places.items():
-            laid[at[:3]] = shares[j]
-        return laid
+        return np.append(shares[self._free], 0.0)  # nothing of the wings
 
 
 def fit_levels(estimate: Estimate) -> Estimate:
@@ -189,11 +176,10 @@ def fit_levels(estimate: Estimate) -> Estimate:
 
 def with_levels(observation: Observation, change: Array) -> Observation:
     """Return an observation with other levels of its background, which stays 0 or more."""
-    background = observation.background
-    each = background if background.ndim == 3 else background[:, None, None]
     rows, columns = (np.arange(n) for n in observation.shape)
     added = np.einsum("ji,iyx->jyx", change, planes(observation, rows[:, None], columns))
-    return observation.replace(background=np.maximum(each + added, 0.0))
+    background = np.add(*together(observation.background, added))
+    return observation.replace(background=np.maximum(background, 0.0))
 
 
 def lights(scene: Scene, change: Array) -> Iterator[Array]:

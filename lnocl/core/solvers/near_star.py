@@ -93,14 +93,10 @@ class Surroundings:
         self.cameras = [Camera(scene, j) for j in range(scene.n_images)]
         self.n_shapes = 0 if raised is None else len(raised)
         self._roots = np.zeros(0) if raised is None else raised**-0.5
-        self._precisions = self._find_precisions() if self.n_shapes else []
-
-    def _find_precisions(self) -> list[Array]:
-        scene = self.scene
-        weights = np.ones((1, 1, 1)) if scene.weights is None else scene.weights
-        weights = np.broadcast_to(weights, (scene.n_images, *scene.image_grid))
-        models = self.estimate.models()
-        return [precision(scene, model, w) for model, w in zip(models, weights, strict=True)]
+        models = estimate.models() if self.n_shapes else ()
+        self._precisions = [
+            precision(scene, model, View(scene, j).weights) for j, model in enumerate(models)
+        ]
 
     def beyond(self, j: int, window: Window) -> Array:
         """Return what image j tells of its halos beyond a window, the extended source unknown.

@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 
 from lnocl.core.scene.arrays import Array
 from lnocl.core.scene.band_matrix import BandMatrix
-from lnocl.core.scene.detector import DetectorPsf
+from lnocl.core.scene.detector import Movable
 from lnocl.core.scene.forward_model import ROUNDING, Model
 from lnocl.core.scene.scene import Scene
-from lnocl.core.scene.shifting import MARGIN, Cutout, MovablePsf
+from lnocl.core.scene.shifting import MARGIN, Cutout
 from lnocl.core.scene.stars import (
     MAX_SHIFT,
     Order,
@@ -258,7 +258,7 @@ class _MovableStars:
 
     def __init__(
         self,
-        psfs: Sequence[MovablePsf | DetectorPsf],
+        psfs: Sequence[Movable],
         turn: Array,
         covered: NDArray[np.bool_],
         positions: Array,

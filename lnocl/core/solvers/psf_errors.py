@@ -27,13 +27,13 @@ from scipy.ndimage import gaussian_filter
 
 from lnocl.core.scene.arrays import Array
 from lnocl.core.scene.cores import fwhm
-from lnocl.core.scene.detector import DetectorPsf
+from lnocl.core.scene.detector import Movable
 from lnocl.core.scene.estimate import Estimate
 from lnocl.core.scene.observation import Observation
 from lnocl.core.scene.psf_edge import psf_edge
 from lnocl.core.scene.psf_field import mapped
 from lnocl.core.scene.remembered import remembered
-from lnocl.core.scene.shifting import Cutout, MovablePsf
+from lnocl.core.scene.shifting import Cutout
 from lnocl.core.scene.smooth_field import SmoothField
 from lnocl.core.scene.transforms import enlarged
 from lnocl.core.scene.view import View
@@ -49,7 +49,6 @@ PIXELS, ZERO_POINTS, SHIFT, WINGS = 0.67, 0.67, 0.5, 0.3
 CORRELATED, SMOOTHED = 0.6, 2.0
 # The variance of a Gaussian of unit full width at half maximum.
 VARIANCE = 1.0 / (8.0 * np.log(2.0))
-Movable = MovablePsf | DetectorPsf
 # Pixels beside a PSF in which the derivatives of its edges ring.
 MARGIN = 8
 # The correlation of theta of two PSFs: those of a library err together, those of a frame alone.
