@@ -10,7 +10,7 @@ import os
 import re
 import sys
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -185,6 +185,12 @@ def installed(module: str, why: str) -> Any:
 def counted(n: int, noun: str) -> str:
     """Return a number with a noun that agrees with it: ``1 image``, ``2 images``."""
     return f"{n} {noun}" if n == 1 else f"{n} {noun}s"
+
+
+def in_words(place: Iterable[float]) -> str:
+    """Return a place as messages have it: ``(20.35, 7)``."""
+    x, y = place
+    return f"({round(x, 2):.7g}, {round(y, 2):.7g})"
 
 
 class LnoclWarning(UserWarning):

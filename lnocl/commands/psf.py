@@ -17,7 +17,7 @@ from lnocl.commands import options, pictures, record
 from lnocl.commands.declared import SATURATION
 from lnocl.commands.options import option, or_word
 from lnocl.commands.parser import Command
-from lnocl.errors import InputError, counted
+from lnocl.errors import InputError, counted, in_words
 
 if TYPE_CHECKING:
     from astropy.io import fits
@@ -286,8 +286,8 @@ def _positions(
         away = [math.dist(place, star) for star in places]
         if min(away, default=math.inf) > NEAR:
             raise InputError(
-                f"{arguments.star_table} has no star within {NEAR} pixels of ({place[0]:.7g}, "
-                f"{place[1]:.7g}), which --without names: see its places, or leave that out"
+                f"{arguments.star_table} has no star within {NEAR} pixels of {in_words(place)}, "
+                "which --without names: see its places, or leave that out"
             )
         del places[int(np.argmin(away))]
     if arguments.without and not places:

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from lnocl.core.scene.counts import means
 from lnocl.core.scene.stars import MAX_SHIFT
-from lnocl.errors import counted
+from lnocl.errors import counted, in_words
 from lnocl.residuals import SIGNIFICANCE, Fit, sharp_sources
-from lnocl.result.verdict import faults, in_words, is_doubt
+from lnocl.result.verdict import faults, is_doubt
 
 if TYPE_CHECKING:
     from lnocl.core.scene.observation import Observation
@@ -236,10 +236,10 @@ def _unnamed(result: Result, unit: Unit) -> Iterator[str]:
     offsets = found[:, None, :2] - result.star_positions
     found = found[(np.hypot(*np.moveaxis(offsets, -1, 0)) > MAX_SHIFT).all(axis=1)]
     if len(found):
-        (x, y, light), n = found[0], len(found)
+        (*place, light), n = found[0], len(found)
         yield (
             f"{counted(n, 'source')} in the extended source {'is' if n == 1 else 'are'} as sharp "
-            f"as stars, the brightest at ({x:.7g}, {y:.7g}) with {light / unit.electrons:.3g} "
+            f"as stars, the brightest at {in_words(place)} with {light / unit.electrons:.3g} "
             f"{unit.name}: give what is a star as `stars` too, and mask what is a cosmic ray"
         )
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -12,7 +12,7 @@ from lnocl.core.scene.detector import on_sky
 from lnocl.core.scene.psfs import PSF_ERROR
 from lnocl.core.scene.star_psfs import owned
 from lnocl.core.scene.stars import MAX_SHIFT
-from lnocl.errors import MisfitWarning, counted, warn
+from lnocl.errors import MisfitWarning, counted, in_words, warn
 from lnocl.progress import Progress
 
 if TYPE_CHECKING:
@@ -169,12 +169,6 @@ class _Told:
         ends = [f"{100 * end([share for *_, share in found]):.0f}" for end in (min, max)]
         shares = "" if ends[0] == "nan" else f", {' to '.join(dict.fromkeys(ends))} %"
         return f"{place}{when * (len(self._labels) > 1)}{more}{shares}"
-
-
-def in_words(place: Iterable[float]) -> str:
-    """Return a place as messages have it."""
-    x, y = place
-    return f"({round(x, 2):.7g}, {round(y, 2):.7g})"
 
 
 def _elsewhere(extended: Array, place: Array, finer: int) -> str:

@@ -15,7 +15,7 @@ from lnocl.core.scene.noise_check import measure_noise
 from lnocl.core.scene.observation import Observation
 from lnocl.core.scene.penalty import Penalty
 from lnocl.core.scene.star_psfs import owned
-from lnocl.errors import counted, note, warn
+from lnocl.errors import counted, in_words, note, warn
 from lnocl.process import ignored_notes, ignored_warnings
 
 # Places that a line names.
@@ -60,11 +60,12 @@ def mask_cores(setup: Setup) -> tuple[Setup, str]:
     lost, named = np.zeros(setup.observation.mask.shape, bool), []
     for each in lost_cores(scene):
         lost[each.image, each.rows, each.columns] |= each.lost
-        x, y = scene.stars[each.star]
         is_flat = np.isfinite(each.level)
         why = f"flat at {each.level:.6g} electrons" if is_flat else "far below what is beside them"
         pixels = counted(int(each.lost.sum()), "pixel")
-        named.append(f"{pixels} of `images[{each.image}]` at ({x:.7g}, {y:.7g}), {why}")
+        named.append(
+            f"{pixels} of `images[{each.image}]` at {in_words(scene.stars[each.star])}, {why}"
+        )
     return _masked(setup, lost, named, "saturated")
 
 

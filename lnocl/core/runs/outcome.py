@@ -17,7 +17,7 @@ from lnocl.core.scene.estimate import Estimate
 from lnocl.core.scene.observation import Observation
 from lnocl.core.scene.scene import Scene
 from lnocl.core.scene.stars import MAX_SHIFT
-from lnocl.errors import warn
+from lnocl.errors import in_words, warn
 from lnocl.residuals import MUCH_EXCHANGED, StarResiduals, judge_stars
 
 if TYPE_CHECKING:
@@ -349,7 +349,7 @@ class StarErrors(NamedTuple):
 
 def _warn_of_undetermined(stars: Array, are_halos: bool) -> None:
     """Warn of stars, and perhaps halos, that the images do not tell from others."""
-    named = ", ".join(f"({x:.7g}, {y:.7g})" for x, y in stars)
+    named = ", ".join(map(in_words, stars))
     lost = [f"flux and position of each star at {named}"] * bool(named)
     lost += ["the amounts of all halos"] * are_halos
     advice = "leave out stars that lie on others"

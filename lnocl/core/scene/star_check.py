@@ -13,7 +13,7 @@ from lnocl.core.scene.cores import centroid, fwhm
 from lnocl.core.scene.detector import psfs_on_detector
 from lnocl.core.scene.scene import Scene
 from lnocl.core.scene.star_weights import warn_of_lost_stars
-from lnocl.errors import counted, warn
+from lnocl.errors import counted, in_words, warn
 
 # The square in which a star is looked at reaches so many widths of its PSF from it, at least and at
 # most so many pixels; the level round it is measured from so many widths on.
@@ -144,10 +144,10 @@ def warn_of_stars(scene: Scene, moves: bool, own: NDArray[np.intp] | None = None
     is_own = np.ones(scene.n_stars, bool) if own is None else np.isin(of_places, own)
     warn_of_lost_stars(scene, is_own & ~scene.is_shown[: scene.n_stars])
     if masked := {of_places[s].item() for s in _masked_stars(scene) if is_own[s]}:
-        x, y = scene.places[min(masked)]
+        place = in_words(scene.places[min(masked)])
         others = f", as {counted(len(masked) - 1, 'other')}" if len(masked) > 1 else ""
         warn(
-            f"the star at ({x:.7g}, {y:.7g}) lies on bad pixels{others}: its flux rests on its "
+            f"the star at {place} lies on bad pixels{others}: its flux rests on its "
             "wings, and so on the PSF's; see to the mask"
         )
     found = [each for each in check_stars(scene) if is_own[each.star]]
@@ -162,18 +162,18 @@ def warn_of_stars(scene: Scene, moves: bool, own: NDArray[np.intp] | None = None
             if finer >= 2
             else ""
         )
-        x, y = scene.stars[worst.star]
+        place = in_words(scene.stars[worst.star])
         warn(
             f"`psfs[{worst.image}]` does not fit: it is {psf / star:.2f} times as wide as the star "
-            f"at ({x:.7g}, {y:.7g}) in `images[{worst.image}]`, FWHM {psf:.2f} and {star:.2f} "
+            f"at {place} in `images[{worst.image}]`, FWHM {psf:.2f} and {star:.2f} "
             f"pixels{hint}"
         )
         return  # the place means little then
     farthest = max(found, key=StarCheck.excess_distance)
     if farthest.excess_distance() > 0 and not moves:
-        (dx, dy), (x, y) = farthest.offset, scene.stars[farthest.star]
+        (dx, dy), place = farthest.offset, in_words(scene.stars[farthest.star])
         warn(
-            f"the star at ({x:.7g}, {y:.7g}) lies ({dx:z.2f}, {dy:z.2f}) pixels from there in "
+            f"the star at {place} lies ({dx:z.2f}, {dy:z.2f}) pixels from there in "
             f"`images[{farthest.image}]`: give its place, take `refine_positions`, or mend the "
             f"centre of `psfs[{farthest.image}]`"
         )
