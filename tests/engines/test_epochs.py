@@ -147,7 +147,8 @@ def test_light_curve_products_omit_fluxes_without_good_pixels():
     np.testing.assert_allclose((curves["flux50"] / curves["contrast50"])[0].value, mean)
     drawn = [axes for axes in result.plot().axes if axes.get_title().startswith("light curves")]
     words = [text.get_text() for text in drawn[0].get_legend().get_texts()]
-    assert words[0] == f"star 1, mean {mean:,.0f} electron".replace(",", " ")
+    shown = f"{mean:,.0f}".replace(",", " ")
+    assert words[0] == f"star 1, mean {shown} electron"
 
 
 def test_a_star_that_images_of_an_epoch_do_not_reach_has_no_flux_there():
