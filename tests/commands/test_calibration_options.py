@@ -179,7 +179,8 @@ class TestFrames:
         electrons = 1.7 * np.reshape([30.0, 60.0], (2, 1, 1))
         np.testing.assert_allclose(fits.getdata("out.fits", "ELECTRONS"), electrons, rtol=1e-6)
         given = fits.getdata("out.fits", "MODELS") / electrons
-        np.testing.assert_allclose(picture.models, given, rtol=1e-6)
+        bad = np.isnan(fits.getdata("out.fits", "RESIDUALS"))  # grey in the picture of the model
+        np.testing.assert_allclose(picture.models, np.where(bad, np.nan, given), rtol=1e-6)
         numbers = range(1, table["TFIELDS"] + 1)
         named = {table[f"TTYPE{i}"]: table.get(f"TUNIT{i}", "") for i in numbers}
         assert named == {
