@@ -284,7 +284,13 @@ def test_shares_of_stars_are_their_light_in_each_region():
     light = np.mean([place(psf, shape, x, y).on_grid(shape) for psf in observation.psfs], axis=0)
     within = [each.flux(light) for each in APERTURES]
     np.testing.assert_allclose(found.shares[:, 0], [1, 0, 0, *within], atol=1e-12)
-    np.testing.assert_allclose(found.stated, outcome.star_errors()[0])
+    of_stars = outcome.star_errors()
+    np.testing.assert_allclose(found.stated, [*of_stars.fluxes, *of_stars.positions.ravel()])
+    np.testing.assert_array_equal(found.shares[:, 1:], np.eye(5, 2, -1))
+    errors = np.zeros((10, 5))
+    np.testing.assert_allclose(
+        dataclasses.replace(found, errors=errors).standard_errors[:3], found.stated
+    )
 
 
 def test_light_is_there_in_the_replicas_whose_errors_leave_some():

@@ -68,11 +68,12 @@ class Bootstrap:
         Of the replicas.
     unit : str
         Of light: ``electron``, or ``electron/s`` where exposures were given.
-    stated : ndarray of float64, shape (n_fluxes,)
+    stated : ndarray of float64, shape (m,)
         Standard errors of stars and halos, `lnocl.Result.star_flux_errors` and
-        `lnocl.Result.halo_flux_errors`.
-    shares : ndarray of float64, shape (k, n_fluxes)
-        The share of each star's light that each quantity holds, 1 for its own flux.
+        `lnocl.Result.halo_flux_errors`, and of the positions of stars that are moved,
+        `lnocl.Result.star_position_errors`.
+    shares : ndarray of float64, shape (k, m)
+        The share of each star's light that each quantity holds, 1 for its own flux or position.
     of_smoothing : ndarray of float64, shape (k,)
         The light of each region less that by as many iterations without smoothing, electrons; 0
         for all else.
@@ -329,7 +330,9 @@ def without_replicas(outcome: Outcome, parts: Sequence[Part], seed: int) -> Boot
     """Return the quantities of a reconstruction, measured on itself, without replicas."""
     width = resolution(outcome.scene)
     quantities, shares = quantities_of(outcome, parts, width)
-    stated = np.nan_to_num(in_electrons(outcome, outcome.star_errors()[0]))
+    errors, is_shown = outcome.star_errors(), outcome.scene.is_shown[: outcome.scene.n_stars]
+    positions = errors.positions[is_shown & outcome.moves].ravel()
+    stated = np.nan_to_num(np.append(in_electrons(outcome, errors.fluxes), positions))
     pixels = np.zeros((3, *outcome.scene.observation.sky_shape))
     none = np.zeros((0, len(quantities)))
     unit = "electron/s" if outcome.setup.is_rate else "electron"

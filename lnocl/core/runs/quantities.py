@@ -74,7 +74,7 @@ def quantities_of(
 ) -> tuple[tuple[Quantity, ...], Array]:
     """Return the quantities in the order of `measure`, and the share of each star's light in each.
 
-    The shares have a row for each quantity, and a column for each flux of a star or halo.
+    The shares have a row for each quantity, and a column for each flux and position of those.
     """
     scene = outcome.scene
     n_epochs, images = scene.observation.n_epochs, range(scene.n_images)
@@ -83,16 +83,16 @@ def quantities_of(
     labels = [Label(f"star {s // n_epochs + 1}{epochs[s % n_epochs]} flux", FLUX) for s in shown]
     halos = range(len(scene.observation.halos))
     labels += [Label(f"halo {k + 1} image {j + 1}", AMOUNT) for k in halos for j in images]
-    n_fluxes = len(labels)
     if outcome.moves:
         labels += [Label(f"star {s + 1} {axis}", LENGTH) for s in shown for axis in "xy"]
-    notes, shares = [""] * len(labels), [*np.eye(len(labels), n_fluxes)]
+    n_stated = len(labels)
+    notes, shares = [""] * n_stated, [*np.eye(n_stated)]
     if parts:
         observed = _observed(scene)
         cutouts = [[scene.psf_on_sky(j, s) for j in images] for s in shown]
     for part in parts:
         own, slices = part.labels(), part.slices if isinstance(part, Profile) else [part]
-        held = np.zeros((len(own), n_fluxes))  # widths hold no light
+        held = np.zeros((len(own), n_stated))  # widths hold no light
         for k, i in np.ndindex(len(slices), len(shown)):
             held[k, i] = _light_within(slices[k], cutouts[i], scene.grid)
         own_notes = [_note(each, scene, width, observed) for each in slices]
@@ -107,7 +107,7 @@ def quantities_of(
         Quantity(label.name, label.kind, value, note, label.at)
         for label, value, note in zip(labels, values, notes, strict=True)
     )
-    return quantities, np.reshape(shares, (len(labels), n_fluxes))
+    return quantities, np.reshape(shares, (len(labels), n_stated))
 
 
 def _light_within(aperture: Aperture, cutouts: Sequence[Cutout], grid: tuple[int, int]) -> float:
