@@ -228,14 +228,16 @@ def _summarise(found: Bootstrap, parts: Sequence[Part], frames: Frames) -> list[
     table = table[[each.at is None for each in found.quantities]]  # profiles are to be drawn
     n_regions = len(_regions(parts))
     table, n_listed = table[np.roll(np.arange(len(table)), n_regions)], max(MAX_LISTED, n_regions)
-    lines = [f"errors by {found.n} replicas, less their bias; in brackets 95 %:"]
+    without = n_regions and not len(found.of_psfs)
+    of_regions = ", of regions without what PSFs have wrong" if without else ""
+    lines = [f"errors by {found.n} replicas{of_regions}, less their bias; in brackets 95 %:"]
     for row in table[:n_listed]:
         note = f"; {row['note']}: do not trust its error" if row["note"] else ""
         if not _OF_STARS.fullmatch(row["name"]) and np.isfinite(row["share"]):
             note = f"; has light in {100 * row['share']:.0f} % of replicas{note}"
         if len(found.of_psfs):
             noise, psf = (rounded(*[row[each]] * 2) for each in ("error_noise", "error_psf"))
-            note += f"; noise {noise}, PSF {psf}"
+            note += f"; of replicas: noise {noise}, PSF {psf}"
         if "error_smoothing" in table.colnames and row["error"] <= row["error_smoothing"]:
             note += "; smoothing changes it by as much as the error"
         low, high = (rounded(row[end], row["error"]) for end in ("low95", "high95"))

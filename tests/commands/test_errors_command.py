@@ -59,7 +59,8 @@ def test_errors_are_added_to_the_file(words, capsys):
     assert cli.main(words) == 0
     assert cli.main([*ERRORS, "10"]) == 0
     said = capsys.readouterr().out
-    assert "errors by 10 replicas, less their bias; in brackets 95 %:\nround: " in said
+    first = "errors by 10 replicas, of regions without what PSFs have wrong, less their bias; in "
+    assert f"{first}brackets 95 %:\nround: " in said
     assert "below the resolution: do not trust its error)" in said
     number = r"-?\d[\d ]*(\.\d+)?"  # to the digits of its error, without an exponent
     shown = rf"round: {number} \+- {number} electron \({number} to {number}; has light"
