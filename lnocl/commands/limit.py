@@ -10,7 +10,7 @@ import numpy as np
 from lnocl.commands import detect, options
 from lnocl.commands.options import option
 from lnocl.commands.parser import Command
-from lnocl.errors import warn
+from lnocl.errors import in_words, warn
 from lnocl.process import ignored_notes
 
 if TYPE_CHECKING:
@@ -113,9 +113,12 @@ def _checked(found: Significance, arguments: argparse.Namespace) -> list[str]:
                 f"{100 * k / n:.0f} +- {100 * error:.0f} %"
             )
             if binom.cdf(k, n, share) < RARE:
+                remedy = "trust only the limits that injections show"
+                if places := [in_words(place) for place in found.detections.iterrows("x", "y")]:
+                    remedy = f"name what is a star of {', '.join(places)} as `stars`, and run again"
                 warn(
                     f"the limit of {100 * share:g} % is too faint{where}: of {n} sources put in "
-                    f"{k} are found; trust only the limits that injections show"
+                    f"{k} are found; {remedy}"
                 )
     return lines
 
