@@ -99,7 +99,10 @@ def faults(result: Result) -> list[str]:
             ", or try `refine_psfs` jitter pixels" if findings.may_free_pixels else ""
         )
         if len(unfitted) < FEW * len(places):
-            remedy = "the PSF fits the others: see whether a cosmic ray or another star lies there"
+            remedy = (
+                "the PSF fits the others: see whether a cosmic ray or another star lies there, or "
+                "beside a star that the PSF was made of"
+            )
         lines.append(
             f"the model does not fit at {len(unfitted)} of "
             f"{counted(len(at_stars) // n_epochs, 'star')}, {unfitted.words(' ')}: {remedy}"
