@@ -23,7 +23,7 @@ from lnocl.psf.steps import cut_square, measure_background, nearest_pixel
 
 # Rounds of fitting the stars and adding what is left of them to the PSF, at least and at most; they
 # end where they change no flux by more than this share. A saturated star settles slowly.
-ROUNDS, MOST_ROUNDS, SETTLED = 20, 200, 3e-5
+ROUNDS, MOST_ROUNDS, SETTLED = 20, 60, 3e-5
 # The first rounds take each pixel for the star nearest to it, so that no star is another's wings.
 FIRST_ROUNDS = 3
 # Outside its core, a star's pixel is a neighbour's where it exceeds another star's by this share,
@@ -32,6 +32,8 @@ EXCESS, BESIDE = 0.5, 2
 # After so many rounds a pixel that exceeds its star by this share of its peak, significantly, is a
 # cosmic ray.
 ROUGH_ROUNDS, RAY = 8, 0.2
+# Pixels at the edge of the squares that no star shows.
+EDGE = 2
 # Half the side of the square whose light is a star's first flux.
 APERTURE = 3
 # A star's core is where it is above this share of its peak; there it is fitted. Where none of that
@@ -274,7 +276,9 @@ class _Stars:
                 foreign[s] |= good[s] & good[t] & outside & (own[s] > limit)
             foreign[s] = binary_dilation(foreign[s], iterations=BESIDE)
         self._n_neighbours = int((foreign & good).sum())
-        return (good & ~foreign).astype(np.float64)
+        # Half of what lies on the edge falls beyond it, and corrections of that would run away.
+        inner = np.pad(np.ones(np.subtract(good.shape[1:], 2 * EDGE)), EDGE)
+        return (good & ~foreign) * inner
 
     def _nearest(self) -> Array:
         """Return where each star's own pixels are nearer to it than to any other: (n, k, k)."""

@@ -146,13 +146,31 @@ def test_a_saturated_star_adds_wings_and_does_not_move_the_centre():
     assert abs(star.psf - expected).max() < 0.04 * expected.max()
 
 
+def moffat(flux, x0, y0, side=96):
+    """Return a Moffat function that is not round."""
+    y, x = np.indices((side, side))
+    return 0.06 * flux * (1 + ((x - x0) ** 2 + 1.2 * (y - y0) ** 2) / 9) ** -3.0
+
+
+@pytest.mark.exhaustive
+@pytest.mark.parametrize("seed", [1000, 1001, 1002])
+def test_a_saturated_star_between_pixels_does_not_run_away(seed):
+    """Half of the edge of its square lies beyond it: corrections of that did."""
+    rng = np.random.default_rng(seed)
+    places = np.array([(25.3, 30.2), (101.1, 27.4), (24.2, 102.3), (104.49, 98.02)])
+    mean = 120.0 + sum(
+        moffat(*each, 128) for each in zip((6e5, 4e5, 5e5, 9e6), *places.T, strict=True)
+    )
+    counts = (rng.poisson(mean) + rng.normal(0.0, 5.0, mean.shape)) / 2.0
+    star, expected = make_psf(np.minimum(counts, 65535), places, 48), moffat(1.0, 24, 24, 48)
+    expected /= expected.sum()
+    assert abs(star.psf - expected).max() < 0.01 * expected.max()
+    np.testing.assert_allclose(star.centres, places, rtol=0, atol=0.02)
+
+
 @pytest.mark.exhaustive
 def test_the_wings_of_a_saturated_star_settle():
     """Its flux, and so their share of the light, settles after tens of rounds."""
-
-    def moffat(flux, x0, y0, side=96):
-        y, x = np.indices((side, side))
-        return 0.06 * flux * (1 + ((x - x0) ** 2 + 1.2 * (y - y0) ** 2) / 9) ** -3.0
 
     places = np.array([(22.3, 25.2), (70.1, 24.4), (25.2, 72.3), (68.2, 70.1)])
     mean = 120.0 + sum(map(moffat, (6e5, 4e5, 5e5, 9e6), *places.T))
