@@ -246,9 +246,11 @@ def _settle(runs: GuardedRuns, state: _State, moves: bool) -> _State:
 
     That mean takes the extended source to be as smooth as its prior. Where it is not, PSFs that are
     right would follow it, and their images fit worse. So where PSFs are not in doubt each stays
-    that fits no better so. Where they are, what one of them fits is as much by the others, and all
-    stay together, if all fit worse. None is used with which a star loses its light. Stars that were
-    moved are moved again for these, but where they follow a host from a flat sky.
+    that fits no better so, if its width changed by less than it may be off: more is no chance, and
+    a bright sky hides what it fits. Where they are in doubt, what one of them fits is as much by
+    the others, and all stay together, if all fit worse. None is used with which a star loses its
+    light. Stars that were moved are moved again for these, but where they follow a host from a flat
+    sky.
     """
     psfs, stars = runs.settled(state.psfs, state.places, moves)
     is_moved = bool((stars != state.places).any())
@@ -256,7 +258,8 @@ def _settle(runs: GuardedRuns, state: _State, moves: bool) -> _State:
         return state
     settled = _State.of(runs, psfs, stars, state.moves or is_moved)
     numbers, rise = alike(runs.whole.observation), settled.misfit.excess - state.misfit.excess
-    stays = (np.bincount(numbers, rise) >= 0)[numbers] & (not state.misfit.is_doubtful)
+    is_slight = abs(_widened(runs.whole.observation, psfs)) <= runs.whole.observation.psf_error
+    stays = (np.bincount(numbers, rise) >= 0)[numbers] & is_slight & (not state.misfit.is_doubtful)
     if stays.all() and not is_moved:
         return state
     if stays.any():
@@ -384,11 +387,15 @@ def _follow(
     return parameters
 
 
+def _widened(observation: Observation, psfs: Psfs) -> Array:
+    """Return by how much wider PSFs are than those of an observation, relative to these, (p,)."""
+    pairs = zip(observation.replace(psfs=psfs).psfs, observation.psfs, strict=True)
+    return np.array([fwhm(after) / fwhm(before) - 1.0 for after, before in pairs])
+
+
 def _tell_widths(observation: Observation, psfs: Psfs) -> None:
     """Say in a line how wide PSFs are that were fitted to the stars, over those given."""
-    fitted = observation.replace(psfs=psfs).psfs
-    pairs = zip(fitted, observation.psfs, strict=True)
-    widths = [100.0 * (fwhm(after) / fwhm(before) - 1.0) for after, before in pairs]
+    widths = 100.0 * _widened(observation, psfs)
     words = " to ".join(dict.fromkeys(f"{width:+.1f}" for width in (min(widths), max(widths))))
     note(f"PSFs fitted to the stars: {words} % in width (`psf_error` 0 leaves them)")
 
