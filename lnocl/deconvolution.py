@@ -304,10 +304,11 @@ def deconvolve(
     its file, zero points of images and a cusp of the extended source under each star are unknowns
     beside the stars, with priors (`lnocl.core.solvers.psf_errors`). The mean of stretch and blur by
     the brightest stars, after a run with a fixed weight, makes the PSFs of the reconstruction,
-    three times in turn (`lnocl.core.runs.psf_posterior`). A PSF stays whose images fit no better.
-    Stars that lie off by more than such PSFs may be shifted are moved, where they may be. Points
-    beside stars that are none of them are held meanwhile (`lnocl.core.solvers.companions`). All of
-    it is marginalised in the errors of fluxes and places (:doc:`/validation/psf_error`).
+    three times in turn (`lnocl.core.runs.psf_posterior`). A PSF stays whose images fit no better,
+    where PSFs are not in doubt and its width changes by less than its `psf_error`. Stars that lie
+    off by more than such PSFs may be shifted are moved, where they may be. Points beside stars that
+    are none of them are held meanwhile (`lnocl.core.solvers.companions`). All of it is marginalised
+    in the errors of fluxes and places (:doc:`/validation/psf_error`).
 
     **PSFs that do not fit** leave light beside a star, and an extended source that is free there
     takes it up. So PSFs are judged by short runs in a window round the stars. In these the
