@@ -58,7 +58,7 @@ def faults(result: Result) -> list[str]:
     labels = findings.observation.epoch_labels
     n_epochs = len(labels)
     unfitted, held, lit, dark, lost, paired = (_Told(labels) for _ in range(6))
-    most = min(findings.observation.psf_error, PSF_ERROR)
+    most, of_cores = min(findings.observation.psf_error, PSF_ERROR), 0.0
     for s, (place, given, flux, found) in enumerate(
         zip(
             result.star_positions, findings.given_positions, result.star_fluxes, at_stars,
@@ -75,6 +75,7 @@ def faults(result: Result) -> list[str]:
             lost.add(s, in_words(given), f" to {in_words(place)}")
         if found.is_misfit:
             if found.core_error < most and not found.wings.is_misfit:
+                of_cores += found.core.square_sum
                 held.add(s, in_words(place), share=found.core_error)
             else:
                 unfitted.add(s, in_words(place))
@@ -107,13 +108,13 @@ def faults(result: Result) -> list[str]:
             f"the model does not fit at {len(unfitted)} of "
             f"{counted(len(at_stars) // n_epochs, 'star')}, {unfitted.words(' ')}: {remedy}"
         )
-    elif held:
+    elif overall.is_misfit and not (dark or lost) and of_cores < 0.5 * overall.square_sum:
+        lines.append("the model does not fit: see to background, noise and gain")
+    if held:
         lines.append(
             f"the PSF is off at {held.count()}, {held.words('; ')}: within its error, which the "
             "errors of fluxes hold"
         )
-    elif overall.is_misfit and not (dark or lost):
-        lines.append("the model does not fit: see to background, noise and gain")
     refinement = result.psf_refinement
     is_fitted = refinement is not None and refinement.has_free_pixels  # which follow the noise
     if overall.is_overfit and not is_fitted:

@@ -139,7 +139,7 @@ def test_a_star_counts_once_and_its_epochs_are_named(nameless):
     assert [is_doubt(each) for each in (unfitted, lit, paired)] == [False, True, True]
 
 
-def of_four(n_bad, psf_error=0.0, core_error=0.02, wings=100.0):
+def of_four(n_bad, psf_error=0.0, core_error=0.02, wings=100.0, overall=Fit()):  # noqa: B008
     """Return the faults of four stars, some of which do not fit."""
     bad = StarResiduals(
         Fit(100, 900.0, 200.0), Fit(100, wings, 200.0), 0.0, 0.0, core_error=core_error
@@ -153,7 +153,7 @@ def of_four(n_bad, psf_error=0.0, core_error=0.02, wings=100.0):
     )
     result = SimpleNamespace(
         star_positions=places, star_fluxes=np.full(4, 5.0), psf_refinement=None, smoothing=0.0,
-        star_residuals=lambda: found, fit=Fit, _findings=findings,
+        star_residuals=lambda: found, fit=lambda: overall, _findings=findings,
     )  # fmt: skip
     return faults(result)
 
@@ -174,6 +174,14 @@ def test_a_misfit_within_the_error_of_psfs_is_a_doubt(nameless):
     for wrong in ({"core_error": 0.04}, {"wings": 900.0}, {"core_error": 0.01, "psf_error": 0.009}):
         (line,) = of_four(1, **{"psf_error": 0.3} | wrong)  # more than PSFs have
         assert not is_doubt(line)
+
+
+@pytest.mark.parametrize(("squares", "is_told"), [(1e4, True), (1.5e3, False)])
+def test_a_misfit_elsewhere_is_told_beside_a_psf_that_is_off(nameless, squares, is_told):
+    """One that cores do not explain: a wrong gain, noise or background."""
+    lines = of_four(1, psf_error=0.03, overall=Fit(1000, squares, 900.0))
+    assert ("the model does not fit: see to background, noise and gain" in lines) == is_told
+    assert is_doubt(lines[-1])
 
 
 @pytest.mark.parametrize("more", [[], ["--quiet"]])
