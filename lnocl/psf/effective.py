@@ -32,7 +32,7 @@ EXCESS, BESIDE = 0.5, 2
 # After so many rounds a pixel that exceeds its star by this share of its peak, significantly, is a
 # cosmic ray.
 ROUGH_ROUNDS, RAY = 8, 0.2
-# Pixels at the edge of the squares that no star shows.
+# Pixels at the edge of the squares that no star shows; fewer of small squares.
 EDGE = 2
 # Half the side of the square whose light is a star's first flux.
 APERTURE = 3
@@ -277,7 +277,8 @@ class _Stars:
             foreign[s] = binary_dilation(foreign[s], iterations=BESIDE)
         self._n_neighbours = int((foreign & good).sum())
         # Half of what lies on the edge falls beyond it, and corrections of that would run away.
-        inner = np.pad(np.ones(np.subtract(good.shape[1:], 2 * EDGE)), EDGE)
+        edge = min(EDGE, self._half // 4)
+        inner = np.pad(np.ones(np.subtract(good.shape[1:], 2 * edge)), edge)
         return (good & ~foreign) * inner
 
     def _nearest(self) -> Array:
