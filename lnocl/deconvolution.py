@@ -307,7 +307,7 @@ def deconvolve(
     three times in turn (`lnocl.core.runs.psf_posterior`). A PSF stays whose images fit no better,
     where PSFs are not in doubt and its width changes by less than its `psf_error`. Stars that lie
     off by more than such PSFs may be shifted are moved, where they may be. Points beside stars that
-    are none of them are held meanwhile (`lnocl.core.solvers.companions`). All of it is marginalised
+    were not named are held meanwhile (`lnocl.core.solvers.companions`). All of it is marginalised
     in the errors of fluxes and places (:doc:`/validation/psf_error`).
 
     **PSFs that do not fit** leave light beside a star, and an extended source that is free there

@@ -172,7 +172,7 @@ class Plan:
         Raises
         ------
         InputError
-            There is no such step.
+            No step has this name.
 
         Examples
         --------

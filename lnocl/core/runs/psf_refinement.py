@@ -245,12 +245,13 @@ def _settle(runs: GuardedRuns, state: _State, moves: bool) -> _State:
     """Return the state with PSFs that are the mean of what they may be, where they fit better.
 
     That mean takes the extended source to be as smooth as its prior. Where it is not, PSFs that are
-    right would follow it, and their images fit worse. So where PSFs are not in doubt each stays
-    that fits no better so, if its width changed by less than it may be off: more is no chance, and
-    a bright sky hides what it fits. Where they are in doubt, what one of them fits is as much by
-    the others, and all stay together, if all fit worse. None is used with which a star loses its
-    light. Stars that were moved are moved again for these, but where they follow a host from a flat
-    sky.
+    right would follow it, and their images fit worse.
+
+    Where no PSF is in doubt, each stays that fits no better so. A PSF whose width changed by more
+    than its error is used all the same, as a bright sky takes up what a wrong one leaves. Where
+    PSFs are in doubt, how well one fits depends on the others: all change, or all stay. None is
+    used with which a star loses its light. Stars that were moved are moved again for these, but
+    where they follow a host from a flat sky.
     """
     psfs, stars = runs.settled(state.psfs, state.places, moves)
     is_moved = bool((stars != state.places).any())
