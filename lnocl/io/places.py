@@ -42,7 +42,7 @@ class Places(NamedTuple):
         Checksum of the file of angles, where there is one.
     """
 
-    maps: dict[str, Array]
+    maps: dict[str, Any]
     header: fits.Header
     sha256: list[str]
 

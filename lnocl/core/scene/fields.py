@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from lnocl.core.scene import arrays, containers
 from lnocl.core.scene.arrays import Array, Mask
+from lnocl.core.scene.components import in_filters, read_component_errors, read_components
 from lnocl.core.scene.geometry import read_geometry
 from lnocl.core.scene.halos import read_halos
 from lnocl.core.scene.psfs import MOST_PSF_ERROR, read_ideal_psfs, read_pixels, read_psfs
@@ -217,6 +218,8 @@ def _epochs(_: Field, epochs: Any, held: Observation) -> NDArray[np.intp]:
         ) from None
     texts = (f"{each:.15g}" if isinstance(each, float) else str(each) for each in distinct.tolist())
     held.epoch_labels = tuple(texts)
+    if held.component_names:
+        numbered, held.epoch_labels = in_filters(held, numbered, held.epoch_labels)
     return numbered.astype(np.intp)
 
 
@@ -274,6 +277,8 @@ FIELDS = {
         Field("psf_error", _psf_error),
         Field("star_places", read_star_places),
         Field("star_psfs", read_star_psfs, "", "psf", of_images=1),
+        Field("components", read_components),
+        Field("component_errors", read_component_errors),
         Field("epochs", _epochs),
         Field("background", _levels, "counts", "pixels"),
         Field("background_error", _levels, "electrons"),
@@ -322,6 +327,8 @@ def hold(
     Given
         The parameters in plain numbers.
     """
+    if "components" in parameters:  # stars have a flux in each of their filters
+        parameters = {"component_errors": None, "epochs": None, **parameters}
     given = Given(parameters)
     for name, field in FIELDS.items():
         if before is not None and name not in parameters and _differs(field, held, before):

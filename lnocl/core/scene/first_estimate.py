@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -25,10 +25,13 @@ ROUNDING = float(np.finfo(np.float32).eps)
 
 
 class RoughFit(NamedTuple):
-    """Fluxes, shape (n_fluxes,), and the level of a flat extended source, scaled."""
+    """Fluxes, shape (n_fluxes,), and the level of a flat extended source, scaled.
+
+    With several skies there is a level of each, shape (K, 1, 1).
+    """
 
     fluxes: Array
-    level: float
+    level: Any
 
 
 def rough_fit(scene: Scene) -> RoughFit:
@@ -36,13 +39,12 @@ def rough_fit(scene: Scene) -> RoughFit:
 
     Halos stand in for the level: what a flat one has in common with the sky goes to the halo.
     """
-    total, n_observed, n_seen = 0.0, 0, 0.0  # pixels of images, and of the sky
+    lights, counts = np.zeros((2, scene.n_images))  # of pixels that were observed
     normal: BandMatrix | None = None
     moment, levels = np.zeros(scene.n_fluxes), []
     for j, (excess, observed) in enumerate(_excesses(scene)):
         light, n_there = float(excess.sum()), int(np.count_nonzero(observed))
-        total, n_observed = total + light, n_observed + n_there
-        n_seen += scene.seen_areas[j] * n_there
+        lights[j], counts[j] = light, n_there
         if not (scene.n_fluxes and n_there):
             continue
         covered = scene.star_field.covered(j)
@@ -53,7 +55,7 @@ def rough_fit(scene: Scene) -> RoughFit:
         levels.append(sums / np.sqrt(n_there))
         level = 0.0 if scene.n_halos else light / n_there
         moment += stars.products(weights * (excess[covered] - level))[0]
-    least = max(LEAST * total / n_observed, ROUNDING)
+    least = max(LEAST * lights.sum() / counts.sum(), ROUNDING)
     if normal is None:
         best = moment
     elif scene.n_halos:
@@ -62,19 +64,32 @@ def rough_fit(scene: Scene) -> RoughFit:
         best = _solve_beside(normal, np.array(levels).T, moment)
     fluxes = np.maximum(best, least * math.prod(scene.image_grid) / 100)
     fluxes[~scene.is_shown] = 0.0
-    level = (total - float(fluxes @ scene.star_weights)) / n_seen
-    return RoughFit(fluxes, max(level, least * n_observed / n_seen))
+    return RoughFit(fluxes, _levels(scene, lights, counts, fluxes, least * counts.sum()))
 
 
-def level_beside(scene: Scene, fluxes: Array) -> float:
+def level_beside(scene: Scene, fluxes: Array) -> Any:
     """Return the level of a flat extended source beside stars and halos of these fluxes."""
-    total, n_observed, n_seen = 0.0, 0, 0.0
-    for (excess, observed), area in zip(_excesses(scene), scene.seen_areas, strict=True):
-        n_there = int(np.count_nonzero(observed))
-        total, n_observed = total + float(excess[observed].sum()), n_observed + n_there
-        n_seen += area * n_there
-    least = max(LEAST * total, n_observed * ROUNDING)
-    return max(total - float(fluxes @ scene.star_weights), least) / n_seen
+    lights, counts = np.zeros((2, scene.n_images))
+    for j, (excess, observed) in enumerate(_excesses(scene)):
+        lights[j], counts[j] = excess[observed].sum(), np.count_nonzero(observed)
+    least = max(LEAST * lights.sum(), counts.sum() * ROUNDING)
+    return _levels(scene, lights, counts, fluxes, least)
+
+
+def _levels(scene: Scene, lights: Array, counts: Array, fluxes: Array, least: float) -> Any:
+    """Return the level that the light of images leaves beside stars, at least that of `least`."""
+    seen, of_stars = scene.seen_areas * counts, fluxes * scene.star_weights
+    if scene.mixing is None:
+        return max(lights.sum() - float(of_stars.sum()), least) / seen.sum()
+    from scipy.optimize import nnls
+
+    levels = []
+    for g in range(len(scene.mixing.rows)):
+        there = scene.mixing.images_of(g)
+        own = scene.shown[:, there].any(axis=1)
+        levels.append((lights[there].sum() - of_stars[own].sum()) / seen[there].sum())
+    found = nnls(scene.mixing.rows, np.array(levels))[0]
+    return np.maximum(found, least / seen.sum())[:, None, None]
 
 
 def _excesses(scene: Scene) -> Iterator[tuple[Array, NDArray[np.bool_]]]:
@@ -109,13 +124,16 @@ def first_estimate(
         fluxes = _check("initial_star_fluxes", given, shape) / scene.unit
         fluxes = np.append(fluxes, rough.fluxes[scene.n_stars :])
     if extended is None:
-        _refuse_if_too_bright(scene, rough.level * math.prod(scene.grid) + float(fluxes.sum()))
-        return np.full(scene.grid, rough.level), fluxes
-    given = _check("initial_extended", extended, scene.observation.sky_shape) / scene.unit
+        flat = np.broadcast_to(rough.level, scene.sky_grid).copy()
+        _refuse_if_too_bright(scene, float(flat.sum() + fluxes.sum()))
+        return flat, fluxes
+    given = _check("initial_extended", extended, scene.observation.skies_shape) / scene.unit
     given = _in_their_unit(scene, given)
     _refuse_if_too_bright(scene, float(given.sum() + fluxes.sum()))
-    beyond = [(0, n - k) for n, k in zip(scene.grid, given.shape, strict=True)]
-    return np.pad(given, beyond, constant_values=given.mean()), fluxes
+    mean = given.mean(axis=(-2, -1), keepdims=True)
+    laid = np.broadcast_to(mean, scene.sky_grid).copy()
+    laid[..., : given.shape[-2], : given.shape[-1]] = given
+    return laid, fluxes
 
 
 def _in_their_unit(scene: Scene, extended: Array) -> Array:
@@ -135,7 +153,7 @@ def _in_their_unit(scene: Scene, extended: Array) -> Array:
         mean = float(extended.mean())
     if mean <= most:
         return extended
-    level = scene.rough_fit.level
+    level = float(np.mean(scene.rough_fit.level))
     warn(
         f"`initial_extended` has {mean / level:.2g} times the light of the images, as in "
         "another unit, and was divided by that; it is in electrons per pixel, per second with "

@@ -95,9 +95,9 @@ class Model:
         return [camera.of_ones() for camera in self.cameras]
 
     def forward(self, extended: Array) -> Array:
-        """Return the ``A_j f``, shape (p, ny, nx)."""
+        """Return the ``A_j f``, shape (p, ny, nx); of several skies, of their mixtures."""
         images = np.empty(self.shape, extended.dtype)
-        for image, seen in zip(images, images_of(self.cameras, extended), strict=True):
+        for image, seen in zip(images, seen_by(self.scene, self.cameras, extended), strict=True):
             image[:] = seen
         return images
 
@@ -108,15 +108,21 @@ class Model:
             yield camera.convolved(camera.shared_spectrum(extended, spectra))
 
     def adjoint(self, arrays: Iterable[Array]) -> Array:
-        """Return ``sum_j A_j^T x_j``, shape (Ny, Nx)."""
+        """Return ``sum_j A_j^T x_j``, shape (Ny, Nx); of several skies, times w_jk, (K, Ny, Nx)."""
         return self.adjoints(arrays, np.ones((1, self.shape[0])))[0]
 
     def adjoints(self, arrays: Iterable[Array], factors: Array) -> Array:
         """Return ``sum_j q_kj A_j^T x_j`` for each k, as `adjoints_of` does."""
-        return adjoints_of(self.cameras, arrays, factors)
+        if (mixes := self.scene.mixes) is None:
+            return adjoints_of(self.cameras, arrays, factors)
+        mixed = (factors[:, None] * mixes.T).reshape(-1, len(mixes))
+        back = adjoints_of(self.cameras, arrays, mixed)
+        return back.reshape(len(factors), -1, *back.shape[1:])
 
     def adjoint_of_cutouts(self, cutouts: Sequence[Cutout]) -> Cutout:
         """Return ``sum_j A_j^T x_j`` of images x_j that are 0 beyond a cutout, one an image.
+
+        It is that of one sky, which all images show.
 
         It is computed in the window that it lies in, where that is smaller than the grid. Outer
         rows and columns below the rounding of its largest value are cut off; where images are
@@ -131,9 +137,10 @@ class Model:
         )
         if self.scene.rotations or len(rows) >= self.grid[0] or len(columns) >= self.grid[1]:
             dark = np.broadcast_to(0.0, self.shape[1:])
-            total = self.adjoint(
+            laid = (
                 each.on_grid(self.shape[1:]) if j in lit else dark for j, each in enumerate(cutouts)
             )
+            total = adjoints_of(self.cameras, laid, np.ones((1, self.shape[0])))[0]
             least = RINGING if self.scene.rotations else ROUNDING
             return Cutout(total, 0, 0).trimmed(least * float(abs(total).max()))
         windows = [self.cameras[j].window(each, (rows, columns)) for j, each in seen.items()]
@@ -157,14 +164,15 @@ class Model:
 
     def images_at(self, boxes: Sequence[Box], extended: Array) -> Array:
         """Return the m_j without stars in a box of each; beyond it they may be 0."""
-        flat = is_flat(extended) and self.scene.transmission is None
+        skies = skies_seen(self.scene, extended)
+        flat = all(map(is_flat, skies)) and self.scene.transmission is None
         if not flat and (self.scene.rotations or self.are_large(boxes)):
             return self.images(extended, np.zeros(self.scene.n_fluxes))
         images = np.zeros(self.shape)
-        for image, box, camera, known in zip(
-            images, boxes, self.cameras, self.background, strict=True
+        for image, sky, box, camera, known in zip(
+            images, skies, boxes, self.cameras, self.background, strict=True
         ):
-            seen = camera.flat * extended[0, 0] if flat else camera.part(extended, _ranges_of(box))
+            seen = camera.flat * sky[0, 0] if flat else camera.part(sky, _ranges_of(box))
             np.maximum(seen + np.broadcast_to(known, image.shape)[box], 0.0, out=image[box])
         return images
 
@@ -180,11 +188,30 @@ def _ranges_of(box: Box) -> Ranges:
     return range(box[0].start, box[0].stop), range(box[1].start, box[1].stop)
 
 
+def skies_seen(scene: Scene, extended: Array) -> list[Array]:
+    """Return the sky that each image shows: of several skies the mixture of its filter."""
+    if scene.mixing is None:
+        return [extended] * scene.n_images
+    mixed = scene.mixing.seen(extended)
+    return [mixed[g] for g in scene.mixing.filters]
+
+
+def seen_by(scene: Scene, cameras: Iterable[Camera], extended: Array) -> Iterator[Array]:
+    """Yield the image that each camera has of the sky that it shows."""
+    if scene.mixing is None:
+        yield from images_of(cameras, extended)
+        return
+    mixed = scene.mixing.seen(extended)
+    spectra: list[dict[Hashable, Spectrum]] = [{} for _ in mixed]
+    for camera, g in zip(cameras, scene.mixing.filters.tolist(), strict=True):
+        yield camera.seen(camera.shared_spectrum(mixed[g], spectra[g]))
+
+
 def model_images(scene: Scene, extended: Array, star_fluxes: Array) -> Iterator[Array]:
     """Yield the m_j, as `Model.images` returns them; nothing but one of them is held."""
     background = scene.background()
     cameras = (Camera(scene, j, is_kept=False) for j in range(scene.n_images))
-    for j, image in enumerate(images_of(cameras, extended)):
+    for j, image in enumerate(seen_by(scene, cameras, extended)):
         _illuminate(image, background[j], scene.star_field.light(j, star_fluxes))
         yield image
 

@@ -123,6 +123,14 @@ class Geometry:
         maps = self.maps + _maps(np.zeros_like(self.turns), by)
         return replace(self, maps=maps, offsets=self.offsets + by)
 
+    def of_images(self, which: Sequence[int]) -> Geometry:
+        """Return that of some of the images."""
+        held = "maps", "turns", "offsets"
+        changes: dict[str, Any] = {name: getattr(self, name)[which] for name in held}
+        if self.orientations:
+            changes["orientations"] = tuple(self.orientations[j] for j in which)
+        return replace(self, **changes)
+
     def shows(self, positions: Array) -> NDArray[np.bool_]:
         """Return which positions, shape (n, 2), lie within any image."""
         places = np.stack([self.places(j, positions) for j in range(len(self.turns))], axis=1)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from copy import copy
 from functools import partial
 from typing import Any
@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from lnocl.core.scene.arrays import Array, together
+from lnocl.core.scene.components import Mixing, filter_names
 from lnocl.core.scene.containers import variances
 from lnocl.core.scene.counts import refuse_overflow, without_negative
 from lnocl.core.scene.fields import (
@@ -42,6 +43,9 @@ BESIDE_PSFS = tuple(
     for name, field in FIELDS.items()
     if field.axes == "psf" and name not in ("psfs", "star_psfs")
 )
+
+# What runs of a filter's images mend, and those of all take over.
+JOINED = "psfs", "psf_scatter", "background"
 
 
 class Observation:
@@ -118,6 +122,15 @@ class Observation:
     epochs : array_like, shape (p,), optional
         The epoch of each image, such as its night: numbers or text. Stars have a flux in each
         epoch, the rest of the sky is common. By default all images are of one epoch.
+    components : mapping of str to array_like, shape (p,), optional
+        Skies of which each image shows a known mixture, by their names, with the weight that each
+        has in each image: ``{"line": [1, 0], "continuum": [1, 1]}`` for an image in a line and one
+        beside it. Weights are zero or more, and tell the 2 to 64 components apart. The extended
+        source is a sky for each component, in electrons per pixel of an image of weight 1. Stars
+        have a flux in each filter, that is in images of equal weights.
+    component_errors : mapping of str to array_like, shape (p,), optional
+        Standard errors of these weights, by name; 0 where none is given. They are in the errors of
+        the light of components.
     oversample : {1, 2, 4}, optional
         Pixels of the sky, and of the PSFs, to one of the images along each axis. More than 1 is for
         detectors with fewer than two pixels to the PSF's width, where offsets of fractions of a
@@ -199,6 +212,10 @@ class Observation:
         The number of each image's epoch, from 0 on, in the order of the labels.
     epoch_labels : tuple of str
         The label of each epoch.
+    components, component_errors : ndarray of float64, shape (p, K)
+        Weights, and their standard errors; K is 0 where there is one sky.
+    component_names : tuple of str
+        Their K names.
     oversample : int
         As given.
     effective_psfs : bool
@@ -234,6 +251,7 @@ class Observation:
         - A halo is 0 on all good pixels of an image.
         - `transmission` is not of the sky's shape, out of range, or 0 everywhere in the images that
           have good pixels.
+        - Weights of `components` are negative or not finite, or do not tell these apart.
         - A label of `epochs` is missing or not a number, or the labels have no order.
         - `transforms` are given beside `offsets`, or shear the images by more than 0.05 pixels.
         - Pixels of an image are smaller than those of the sky, by its transform.
@@ -281,6 +299,9 @@ class Observation:
     psf_error: float
     star_places: Array
     star_psfs: Array
+    components: Array
+    component_errors: Array
+    component_names: tuple[str, ...]
     epochs: NDArray[np.intp]
     epoch_labels: tuple[str, ...]
     background: Array
@@ -308,6 +329,8 @@ class Observation:
         halos: ArrayLike | None = None,
         transmission: ArrayLike | None = None,
         epochs: ArrayLike | None = None,
+        components: Mapping[str, ArrayLike] | None = None,
+        component_errors: Mapping[str, ArrayLike] | None = None,
         oversample: int = 1,
         effective_psfs: bool = False,
         psf_centre: PsfCentre = "check",
@@ -410,6 +433,21 @@ class Observation:
     def n_epochs(self) -> int:
         """Number of epochs, in each of which stars have a flux."""
         return int(self.epochs.max()) + 1
+
+    @property
+    def n_skies(self) -> int:
+        """Number of components, or 1 where there are none."""
+        return max(len(self.component_names), 1)
+
+    @property
+    def skies_shape(self) -> tuple[int, ...]:
+        """Shape of the extended source: `sky_shape`, or with several components (K, ny, nx)."""
+        return (self.n_skies, *self.sky_shape) if self.component_names else self.sky_shape
+
+    @property
+    def mixing(self) -> Mixing:
+        """How images show the components, where there are any."""
+        return Mixing.of(self.components)
 
     @property
     def psfs_over_images(self) -> Psfs:
@@ -614,6 +652,43 @@ class Observation:
         refuse_dark(other.halos, other.mask)
         return other._closed()
 
+    def of_images(self, which: Sequence[int]) -> Observation:
+        """Return the observation of some images, upright ones of one filter, as of one sky."""
+        numbers_of, labels = np.unique(self.epochs[which], return_inverse=True)
+        changes: dict[str, Any] = {
+            "geometry": self.geometry.of_images(which),
+            "psf_fields": tuple(self.psf_fields[j] for j in which) if self.psf_fields else (),
+            "components": np.zeros((len(which), 0)),
+            "component_errors": np.zeros((len(which), 0)),
+            "component_names": (),
+            "epochs": labels.ravel().astype(np.intp),
+            "epoch_labels": tuple(self.epoch_labels[k] for k in numbers_of),
+            "background_error": self.background_error[which],
+        }
+        for name, field in FIELDS.items():
+            if field.axes and name not in changes:
+                values = getattr(self, name)
+                is_of_images = values.ndim > field.of_images and values.shape[field.of_images] > 0
+                if is_of_images and values.size:
+                    changes[name] = _of_images(values, which, field.of_images)
+        changes["exposure"] = self.exposure[which]
+        return self._with(changes)._closed()
+
+    def joined(self, parts: Sequence[tuple[Sequence[int], Observation]]) -> Observation:
+        """Return this observation with PSFs and levels of parts, `of_images`, that were mended."""
+        changes: dict[str, Any] = {"psf_error": max(each.psf_error for _, each in parts)}
+        order = np.argsort(np.concatenate([which for which, _ in parts]))
+        for name in JOINED:
+            stacks = [getattr(each, name) for _, each in parts]
+            if any(map(len, stacks)):
+                dark = [np.zeros((len(which), *self.psfs.shape[1:])) for which, _ in parts]
+                pairs = zip(stacks, dark, strict=True)
+                changes[name] = np.concatenate([a if len(a) else b for a, b in pairs])[order]
+        if self.psf_fields:
+            fields = [field for _, each in parts for field in each.psf_fields]
+            changes["psf_fields"] = tuple(fields[j] for j in order)
+        return self._with(changes)._closed()
+
     def transmission_of(self, rows: range, columns: range) -> Array:
         """Return the `transmission` of some rows and columns of the sky.
 
@@ -693,11 +768,24 @@ class Observation:
             rows["exposure"] = _range(self.exposure)
         if len(self.halos):
             rows["halos"] = f"{len(self.halos)}, fitted in each image"
-        if self.n_epochs > 1:
+        if self.component_names:
+            shown = filter_names(self.mixing.rows, self.component_names)
+            rows["components"] = (
+                f"{', '.join(self.component_names)}; images show {', '.join(shown)}"
+            )
+        elif self.n_epochs > 1:
             rows["epochs"] = f"{self.n_epochs}"
         if self.oversample > 1:
             rows["sky"] = f"{self.oversample} pixels to one of the images along each axis"
         return rows
+
+
+def _of_images(values: NDArray[Any], which: Sequence[int], axis: int) -> NDArray[Any]:
+    """Return those of some images; one array for all of them stays one."""
+    if values.strides[axis] == 0:
+        shape = *values.shape[:axis], len(which), *values.shape[axis + 1 :]
+        return np.broadcast_to(values.take([0], axis), shape)
+    return values.take(which, axis)
 
 
 def _range(values: Array) -> str:

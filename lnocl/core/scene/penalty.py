@@ -48,6 +48,11 @@ class Penalty:
     near_stars : ndarray of float64, of the shape of the extended source, or None
         Weight of the edge-preserving term beside `smoothing` in each pixel; a pair of pixels has
         the mean of both. None: 0 everywhere.
+    shares : tuple of float
+        With several skies that by which `smoothing` is multiplied in each; empty for 1.
+    spectral : float
+        Weight of the term between each pixel of one sky and that of the next, such as the slices
+        of a cube; zero or more.
     stars : StarPrior or None
         Of star fluxes, electrons, which the objective leaves out.
     exposure : float or None
@@ -63,11 +68,14 @@ class Penalty:
     smoothing: float = 0.0
     edge: float | None = None
     near_stars: Array | None = field(default=None, compare=False)
+    shares: tuple[float, ...] = ()
+    spectral: float = 0.0
     stars: StarPrior | None = field(default=None, compare=False)
     exposure: float | None = None
 
     def __post_init__(self) -> None:
         weights: dict[str, Any] = {"mu": self.mu, "smoothing": self.smoothing}
+        weights["spectral_smoothing"] = self.spectral
         for name, weight in weights.items():
             if not (isinstance(weight, Real) and _is_weight(cast(float, weight))):
                 raise InputError(
@@ -87,13 +95,28 @@ def recommend_smoothing(observation: Observation) -> float:
 
     It is `SMOOTHING` times the standard deviation of the gradient of the data term by the noise of
     the counts, ``sqrt(sum_j <e_j^2 / g_j> sum K_j^2)``, e_j the exposures over their mean, < > the
-    mean over the observed pixels, K_j as these see it.
+    mean over the observed pixels, K_j as these see it. With several skies it is that of the first.
     """
+    return float(_recommended(observation)[0])
+
+
+def shares_of_skies(observation: Observation) -> tuple[float, ...]:
+    """Return that weight of each sky over that of the first; empty where there is one sky.
+
+    The sum of each has ``w_jk^2`` in it, with w_jk the weight of sky k in image j.
+    """
+    weights = _recommended(observation)
+    return tuple((weights / weights[0]).tolist()) if len(weights) > 1 else ()
+
+
+def _recommended(observation: Observation) -> Array:
     relative = observation.exposure / mean_exposure(observation)
     variances = np.divide(*together(relative**2, np.maximum(observation.images, 1.0)))
     variance = np.ma.masked_array(variances, observation.mask).mean(axis=(1, 2))
     squares = (psfs_on_detector(observation) ** 2).sum(axis=(1, 2))
-    return SMOOTHING * float(np.sqrt((variance * squares).sum()))
+    told = np.asarray(variance * squares)
+    mixes = observation.components if observation.component_names else np.ones((len(told), 1))
+    return np.asarray(SMOOTHING * np.sqrt(told @ mixes**2))
 
 
 def _is_weight(number: float) -> bool:

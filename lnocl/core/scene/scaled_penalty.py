@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from lnocl.core.scene.arrays import Array
 from lnocl.core.scene.penalty import MAX_WEIGHT, Penalty
@@ -17,8 +19,8 @@ if TYPE_CHECKING:
 EDGE = 3.0
 
 
-# The attributes mu, smoothing, smoothing_map, edge and star_prior of a scene.
-Scaled = tuple[float, float, Array | None, float, StarPrior | None]
+# The attributes mu, smoothing, smoothing_map, edge, star_prior and spectral_smoothing of a scene.
+Scaled = tuple[float, Any, Array | None, Any, StarPrior | None, float]
 
 
 def scaled(penalty: Penalty, scene: Scene) -> Scaled:
@@ -30,15 +32,20 @@ def scaled(penalty: Penalty, scene: Scene) -> Scaled:
         One is too large for float32.
     """
     longer = 1.0 if penalty.exposure is None else penalty.exposure / scene.mean_exposure
-    smoothing = _scaled("smoothing", penalty.smoothing, longer, scene)
-    smoothing_map, edge = None, 0.0
+    smoothing: Any = _scaled("smoothing", penalty.smoothing, longer, scene)
+    spectral = _scaled("spectral_smoothing", penalty.spectral, longer, scene)
+    if scene.mixing is not None:
+        smoothing = smoothing * np.reshape(penalty.shares or [1.0] * scene.n_skies, (-1, 1, 1))
+    smoothing_map, edge = None, 0.0 * smoothing
     if penalty.near_stars is not None:
         smoothing_map = smoothing + longer * enlarged(penalty.near_stars, scene.grid)
-    if smoothing > 0 or smoothing_map is not None:
-        edge = EDGE * scene.rough_fit.level if penalty.edge is None else penalty.edge / scene.unit
+    if np.any(smoothing) or smoothing_map is not None or spectral:
+        edge = EDGE * scene.rough_fit.level
+        if penalty.edge is not None:
+            edge = 0.0 * smoothing + penalty.edge / scene.unit
     mu = _scaled("mu", penalty.mu, scene.scale * longer**2, scene)
     star_prior = penalty.stars and penalty.stars.scaled(scene.unit, scene.scale)
-    return mu, smoothing, smoothing_map, edge, star_prior
+    return mu, smoothing, smoothing_map, edge, star_prior, spectral
 
 
 def _scaled(name: str, weight: float, factor: float, scene: Scene) -> float:

@@ -74,6 +74,10 @@ class Scene:
         Shape (ny, nx), `lnocl.core.scene.grid.LENGTHS`; the images lie at its origin.
     grid : tuple of int
         Shape (Ny, Nx) of the sky's grid: that of the images, finer by `oversample`.
+    mixing : Mixing or None
+        How images show several skies, where there are some.
+    sky_grid : tuple of int
+        Shape of the extended source: `grid`, or with several skies (K, Ny, Nx).
     oversample : int
         Pixels of the sky to one of the images, along each axis.
     stars : ndarray of float64, shape (n, 2)
@@ -99,12 +103,15 @@ class Scene:
     penalty : Penalty
         On the extended source.
     mu, smoothing : float
-        Its weights, scaled.
-    smoothing_map : ndarray of float64, shape (Ny, Nx), or None
+        Its weights, scaled; with several skies a smoothing of each, shape (K, 1, 1).
+    smoothing_map : ndarray of float64, shape `sky_grid`, or None
         The weight of the edge-preserving term in each pixel, scaled, where the penalty has a map;
         with `smoothing` in it.
     edge : float
-        delta of the edge-preserving term, scaled; 0 where there is no such term.
+        delta of the edge-preserving term, scaled; 0 where there is no such term; with several
+        skies that of each, shape (K, 1, 1).
+    spectral_smoothing : float
+        The weight of that term between one sky and the next, scaled.
     star_prior : StarPrior or None
         That of the penalty, scaled.
     weights : ndarray of bool or float64, shape (p, ny, nx) of the images' grid, or None
@@ -153,6 +160,9 @@ class Scene:
         self.image_grid = grid_of(observation, self.pad)
         ny, nx = self.image_grid
         self.grid = self.oversample * ny, self.oversample * nx
+        self.mixing = observation.mixing if observation.component_names else None
+        n_skies = observation.n_skies
+        self.sky_grid = self.grid if self.mixing is None else (n_skies, *self.grid)
         # A power of two just above the mean; 1 where that is 0.
         n_good = int(np.count_nonzero(~observation.mask))
         # Bad pixels hold 0.
@@ -243,14 +253,31 @@ class Scene:
 
     def _penalise(self, penalty: Penalty) -> None:
         self.penalty = penalty
-        self.mu, self.smoothing, self.smoothing_map, self.edge, self.star_prior = scaled(
-            penalty, self
-        )
+        found = scaled(penalty, self)
+        self.mu, self.smoothing, self.smoothing_map, self.edge, self.star_prior = found[:-1]
+        self.spectral_smoothing = found[-1]
 
     @property
     def is_smoothed(self) -> bool:
         """Whether the extended source has an edge-preserving term."""
-        return self.smoothing > 0 or self.smoothing_map is not None
+        has_weight = bool(np.any(self.smoothing)) or self.spectral_smoothing > 0
+        return has_weight or self.smoothing_map is not None
+
+    @property
+    def n_skies(self) -> int:
+        """Number of skies, K."""
+        return 1 if self.mixing is None else self.mixing.weights.shape[1]
+
+    @property
+    def mixes(self) -> Array | None:
+        """The weight of each sky in each image, shape (p, K); None where there is one sky."""
+        return None if self.mixing is None else self.mixing.weights
+
+    @property
+    def flux_mixes(self) -> Array:
+        """The weights of the skies in the images that show a flux, shape (n_fluxes, K)."""
+        mixes = np.ones((self.n_images, 1)) if self.mixing is None else self.mixing.weights
+        return mixes[self.shown.argmax(axis=1)]
 
     def prior_of_fluxes(self) -> tuple[Array, Array]:
         """Return flux and precision of the prior of each flux; a precision of 0 where none is."""
@@ -540,7 +567,8 @@ class Scene:
 
     def observed(self, total_weight: Array) -> NDArray[np.bool_]:
         """Return where the extended source was observed, from ``sum_j A_j^T w_j``."""
-        return total_weight >= OBSERVED_SHARE * total_weight.max()
+        most = total_weight.max(axis=(-2, -1), keepdims=True)
+        return np.asarray(total_weight >= OBSERVED_SHARE * most)
 
     def start(
         self, extended: ArrayLike | None, star_fluxes: ArrayLike | None
@@ -549,7 +577,7 @@ class Scene:
 
         Parameters
         ----------
-        extended : array_like, of shape `lnocl.Observation.sky_shape`, optional
+        extended : array_like, of shape `lnocl.Observation.skies_shape`, optional
             Extended source, electrons per pixel, finite and not negative. Beyond the images the
             grid is filled with its mean. By default flat, with the flux that the stars leave. One
             that is far brighter than the images is made as bright as that.
@@ -569,7 +597,7 @@ class Scene:
     @property
     def level(self) -> float:
         """The mean of the extended source, electrons per pixel of it, by linear least squares."""
-        return self.rough_fit.level * self.unit
+        return float(self.rough_fit.level * self.unit)
 
     @cached_property
     def rough_fit(self) -> RoughFit:

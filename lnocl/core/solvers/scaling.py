@@ -37,7 +37,7 @@ class Scaling:
 
     Attributes
     ----------
-    shift : ndarray of float64, shape (Ny, Nx)
+    shift : ndarray of float64, of the shape of the extended source
         z in the scaling ``D = (f + z) / (alpha + mu (f + z))``, ``alpha = sum_j A_j^T w_j``: a
         share of ``alpha / sum_j A_j^T (w_j / (sum_s c_s P_js + b_j))``, the light of stars and
         background that reaches the pixel.
@@ -47,7 +47,7 @@ class Scaling:
         The values of `cross_information`, one cutout after the other.
     cross_windows : ndarray of int32, shape (n, 4)
         For each cutout y, x, height and width.
-    total_weight : ndarray of float64, shape (Ny, Nx), or None
+    total_weight : ndarray of float64, of the same shape, or None
         alpha, where that is not the number of images.
     """
 
@@ -133,7 +133,8 @@ def prepare(
         stars, scaling = prepare(known.scene, known, extended, stars)
         return np.append(stars, halos), scaling.holding(len(halos))
     total_weight, inverse = _back_projections(model)
-    kept = None if scene.weights is None else np.array(total_weight)  # no view of more
+    is_plain = scene.weights is None and scene.mixing is None
+    kept = None if is_plain else np.array(total_weight)  # no view of more
     information = BandMatrix(np.zeros((1, 0)), np.zeros(0, int))
     values, windows = np.zeros(0), np.zeros((0, 4), np.int32)
     if scene.n_fluxes:
@@ -142,8 +143,7 @@ def prepare(
         observed = np.where(scene.observed(total_weight), extended, 0.0)
         diffuse = model.images_at(boxes, observed)
         star_fluxes = fit_fluxes(scene, model, diffuse, star_fluxes)
-        change = _change_by_stars(model, star_fluxes, boxes)
-        inverse[change.window(scene.grid)] += change.values
+        _add_change_by_stars(inverse, model, star_fluxes, boxes)
         information, ratios = _star_information(scene, model, diffuse, star_fluxes, covered)
         values, windows = _cross_information(scene, model, ratios)
     shift = np.divide(total_weight, inverse, out=np.zeros_like(inverse), where=inverse > 0)
@@ -183,12 +183,22 @@ def _back_projections(model: Model) -> tuple[Array, Array]:
     return model.adjoint(model.weights), model.adjoint(per_background)
 
 
-def _change_by_stars(model: Model, star_fluxes: Array, boxes: Sequence[Box]) -> Cutout:
-    """Return the change of ``sum_j A_j^T (w_j / b_j)`` by the light of stars."""
+def _add_change_by_stars(
+    inverse: Array, model: Model, star_fluxes: Array, boxes: Sequence[Box]
+) -> None:
+    """Add the change of ``sum_j A_j^T (w_j / b_j)`` by the light of stars."""
     changes = _changes(model, star_fluxes, boxes)
     if model.are_large(boxes):  # one after the other, lest all are held
-        return Cutout(model.adjoint(each.on_grid(model.shape[1:]) for each in changes), 0, 0)
-    return model.adjoint_of_cutouts(list(changes))
+        inverse += model.adjoint(each.on_grid(model.shape[1:]) for each in changes)
+        return
+    held, mixes = list(changes), model.scene.mixes
+    if mixes is None:
+        mixes, inverse = np.ones((len(held), 1)), inverse[None]
+    for sky, shares in zip(inverse, mixes.T.tolist(), strict=True):
+        change = model.adjoint_of_cutouts(
+            [each._replace(values=w * each.values) for w, each in zip(shares, held, strict=True)]
+        )
+        sky[change.window(model.grid)] += change.values
 
 
 def _changes(model: Model, star_fluxes: Array, boxes: Sequence[Box]) -> Iterator[Cutout]:
