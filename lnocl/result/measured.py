@@ -56,7 +56,7 @@ class Findings(Protocol):
     def halo_amounts(self, fluxes: Array) -> Array:
         """Return those of fluxes that are of halos, electrons of each image, shape (n_halos, p)."""
 
-    def extended_flux(self, star_flux_errors: Array) -> tuple[float, float]:
+    def extended_flux(self, star_flux_errors: Array) -> tuple[Any, Any]:
         """Return the light of the extended source and its standard error, electrons."""
 
     def star_residuals(self) -> list[StarResiduals]:
@@ -227,8 +227,11 @@ class Measured:
         return errors
 
     @cached_property
-    def extended_flux(self) -> tuple[float, float]:
+    def extended_flux(self) -> tuple[Any, Any]:
         r"""The light of the extended source in the frame and its standard error, electrons.
+
+        With components they are arrays of shape (K,), and hold what weights of components may have
+        wrong (`lnocl.core.solvers.light`).
 
         It is the sum of the extended source and of what the residuals have beside it
         (`lnocl.core.solvers.light`), so that it has no bias, and may be negative where there is
