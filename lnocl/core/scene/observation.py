@@ -450,6 +450,11 @@ class Observation:
         return (self.n_skies, *self.sky_shape) if self.component_names else self.sky_shape
 
     @property
+    def filter_names(self) -> list[str]:
+        """The name of each filter: the components that its images show."""
+        return filter_names(self.mixing.rows, self.component_names) if self.component_names else []
+
+    @property
     def mixing(self) -> Mixing:
         """How images show the components, where there are any."""
         return Mixing.of(self.components)
