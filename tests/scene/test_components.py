@@ -172,7 +172,8 @@ def test_images_of_a_filter_are_as_they_are_alone():
     own = np.random.default_rng(3).random((1, 4, 5, 5)) / 50.0
     observation = observe({"line": [1, 0, 1, 0], "continuum": [1, 1, 1, 1]}, star_psfs=own, **given)
     part = observation.of_images([0, 2])
-    assert part.component_names == () and part.epoch_labels == observation.epoch_labels[:2]
+    assert part.component_names == ()
+    assert part.epoch_labels == observation.epoch_labels[:2]
     for name in ("images", "mask", "exposure", "psfs", "offsets", "background"):
         np.testing.assert_array_equal(getattr(part, name), getattr(observation, name)[[0, 2]])
     np.testing.assert_array_equal(part.star_psfs, observation.star_psfs[:, [0, 2]])
@@ -180,4 +181,5 @@ def test_images_of_a_filter_are_as_they_are_alone():
     joined = observation.joined([([0, 2], wider), ([1, 3], observation.of_images([1, 3]))])
     np.testing.assert_array_equal(joined.psfs[[0, 2]], wider.psfs)
     np.testing.assert_array_equal(joined.psfs[[1, 3]], observation.psfs[[1, 3]])
-    assert joined.psf_error == 0.1 and joined.component_names == ("line", "continuum")
+    assert joined.psf_error == 0.1
+    assert joined.component_names == ("line", "continuum")

@@ -93,7 +93,8 @@ def test_what_is_printed_names_components_and_filters():
     lines = str(result()).splitlines()
     assert lines[0].split()[:2] == ["images", "of"]
     assert [line.split()[0] for line in lines[1:5]] == ["line", "continuum", "line", "continuum"]
-    assert "epoch" not in str(result()) and "nan" not in str(result())
+    assert "epoch" not in str(result())
+    assert "nan" not in str(result())
 
 
 def test_the_order_of_components_does_not_matter():
@@ -141,7 +142,7 @@ def test_the_error_of_the_light_is_its_scatter():
 
 def test_weights_that_are_off_are_in_the_errors_of_light():
     sure, unsure = result(), result(0.1)
-    (line, continuum), before = sure.extended_flux
+    (_line, continuum), before = sure.extended_flux
     after = unsure.extended_flux[1]
     assert after[0] == pytest.approx(np.hypot(before[0], 0.1 * continuum), rel=1e-6)
     assert after[1] == pytest.approx(before[1], rel=1e-6)
@@ -168,7 +169,8 @@ def test_replicas_measure_each_component_and_how_bright_it_is_over_the_continuum
     ]
     values, errors = found.values, found.standard_errors
     assert values[4] == pytest.approx(values[2] / values[3])
-    assert (errors > 0).all() and found.error_map.shape == (2, *SHAPE)
+    assert (errors > 0).all()
+    assert found.error_map.shape == (2, *SHAPE)
     truth = regions[0].to_mask("exact").multiply(LINE).sum()
     assert abs(values[2] - truth) < 3 * errors[2]
 
@@ -253,13 +255,14 @@ def test_start_and_smoothing_are_of_each_sky():
     scene = Scene(observe(), [STAR])
     assert scene.sky_grid == (2, *scene.grid)
     start = scene.start(np.ones((2, *SHAPE)) * [[[3.0]], [[5.0]]], None)[0] * scene.unit
-    assert start[0, 3, 3] == pytest.approx(3.0) and start[1, 3, 3] == pytest.approx(5.0)
+    assert start[0, 3, 3] == pytest.approx(3.0)
+    assert start[1, 3, 3] == pytest.approx(5.0)
     with pytest.raises(InputError, match=r"shape \(16, 32\); it must have \(2, 16, 32\)"):
         scene.start(np.ones(SHAPE), None)
 
 
 def test_a_point_is_found_in_the_images_of_a_filter():
-    y, x = np.indices((48, 48))
+    _y, _x = np.indices((48, 48))
     psf = psfs_of(1)[0]
     rng = np.random.default_rng(4)
     means = np.full((2, 48, 48), 12.0)
