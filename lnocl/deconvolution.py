@@ -400,7 +400,8 @@ def _finish(outcome: Outcome, plan: Plan, prepared: Prepared, progress: bool) ->
     """Return an outcome with what the plan has marginal, and how well PSFs fit."""
     is_within = prepared.is_within
     if plan.does(STARS) and not plan.does(PSFS):  # as all stars have PSFs of their own
-        is_within = not any(star.is_misfit for star in judge_stars(outcome.estimate))
+        judged = (judge_stars(part.estimate) for part in outcome.estimate.parts)
+        is_within = not any(star.is_misfit for stars in judged for star in stars)
     if prepared.stop == "held-out" and outcome.stop_reason not in ("held-out", "callback"):
         is_within = False  # what leaves them without an end leaves marginal fluxes without sense
     has_halos, has_levels = plan.does(HALOS), plan.does(LEVELS)

@@ -61,6 +61,8 @@ PARTS = {
     "PLAN": Part(("step", "done")),
     "MESSAGES": Part(("message",)),
     "EPOCHS": Part(("label",)),
+    # The planes of the extended source, where it has several.
+    "COMPONENTS": Part(("name", "flux", "flux_error")),
     # One row: the outcome of the run, from which errors and detections begin.
     "ESTIMATE": Part(("digest",)),
     # What was measured, and regions; the standard error and bias of each pixel, and the share of

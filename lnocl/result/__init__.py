@@ -48,7 +48,7 @@ class Result(Measured):
     ----------
     extended : ndarray of float64
         Extended source, electrons per pixel of it. Its shape is the observation's ``sky_shape``:
-        that of the images, times ``oversample``.
+        that of the images, times ``oversample``; with ``components`` (K, ny, nx), one sky each.
     star_fluxes : ndarray of float64, shape (n,)
         Electrons, in the order of the stars given. NaN where no good pixel shows a star, at all or
         in an epoch.
@@ -130,6 +130,45 @@ class Result(Measured):
     @property
     def _observation(self) -> Observation:
         return self._findings.observation
+
+    @property
+    def component_names(self) -> tuple[str, ...]:
+        """The names of the components, in the order of `extended`; empty where there is one sky."""
+        return self._observation.component_names
+
+    def component(self, name: str) -> Array:
+        """Return the sky of a component, electrons per pixel in an image of weight 1.
+
+        Parameters
+        ----------
+        name : str
+            Its name, as given to `lnocl.Observation`.
+
+        Returns
+        -------
+        ndarray of float64, shape (ny, nx)
+            Its plane of `extended`.
+
+        Raises
+        ------
+        InputError
+            No component has this name.
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> import lnocl
+        >>> images, psf = [np.full((8, 8), 9.0), np.full((8, 8), 4.0)], np.ones((1, 1))
+        >>> components = {"line": [1, 0], "continuum": [1, 1]}
+        >>> observation = lnocl.Observation(images, psf, components=components)
+        >>> result = lnocl.deconvolve(observation, stop=None, n_iter=20, engine="numpy")
+        >>> result.component("line").mean().round(2)
+        np.float64(5.0)
+        """
+        if name not in self.component_names:
+            known = ", ".join(self.component_names) or "none was given"
+            raise InputError(f"no component is called {name!r}: {known}")
+        return self.extended[self.component_names.index(name)]
 
     @property
     def psfs(self) -> Array:
@@ -409,11 +448,12 @@ class Result(Measured):
         rows = {
             "iterations": f"{self.n_iter} ({self.stop_reason})",
             "stars": "\n".join(shown) or "none",
-            "extended source": "{:.5g} +- {:.2g}".format(*self.extended_flux),
+            **self._light_rows(),
             **dict(self._halo_rows()),
             "device": self.device,
         }
-        return html_card("lnocl.Result", rows, self.extended)
+        first = self.extended if self.extended.ndim == 2 else self.extended[0]
+        return html_card("lnocl.Result", rows, first)
 
     @property
     def _unit(self) -> str:
@@ -440,11 +480,17 @@ class Result(Measured):
         return with_names("\n".join(summary_lines(self)))
 
     def __repr__(self) -> str:
-        shape = " x ".join(map(str, self.extended.shape[::-1]))
+        shape = " x ".join(map(str, self.extended.shape[:-3:-1]))
         return (
             f"<lnocl.{type(self).__name__} of {counted(len(self.star_positions), 'star')} and "
             f"{shape} pixels after {counted(self.n_iter, 'iteration')}>"
         )
+
+    def _light_rows(self) -> dict[str, str]:
+        """Return the light of the extended source, or of each component, in words."""
+        names = self.component_names or ("extended source",)
+        fluxes = zip(names, *map(np.atleast_1d, self.extended_flux), strict=True)
+        return {name: f"{flux:.5g} +- {error:.2g}" for name, flux, error in fluxes}
 
     def _halo_rows(self) -> list[tuple[str, str]]:
         """Return the name of each halo, and its amounts in words, electrons."""

@@ -70,7 +70,7 @@ def write_file(
         The file cannot be written, or exists and must not be overwritten.
     """
     name, electrons = unit or (result._unit, 1.0)
-    flux, error = (each / electrons for each in result.extended_flux)
+    fluxes, errors = (np.atleast_1d(each) / electrons for each in result.extended_flux)
     refinement, observation = result.psf_refinement, result._observation
     own: list[Card] = [
         ("CREATOR", f"lnocl {version('lnocl')}", "program that wrote this file"),
@@ -79,8 +79,8 @@ def write_file(
         ("MU", result.mu, "weight of the Tikhonov term, per electron"),
         ("SMOOTHIN", result.smoothing, "weight of the edge-preserving term"),
         ("DEVICE", result.device, "device"),
-        ("EXTFLUX", flux, "flux of the extended source"),
-        ("EXTERROR", error, "its standard error"),
+        ("EXTFLUX", float(fluxes[0]), "flux of the extended source, or first component"),
+        ("EXTERROR", float(errors[0]), "its standard error"),
         ("ONEUNIT", f"{float(electrons)} {result._unit}", "what one BUNIT is"),
         ("RESIDRMS", result.fit().rms, "rms residual, 1 by noise"),
         ("VERDICT", "; ".join(result.verdict()), ""),
@@ -91,6 +91,13 @@ def write_file(
         "HISTORY": result.history,
         "HELDOUT": result.held_out if result.held_out.size else None,
     }
+    if names := result.component_names:
+        light = column_unit(name)
+        parts["COMPONENTS"] = [
+            Column("name", names),
+            Column("flux", fluxes, light),
+            Column("flux_error", errors, light, "standard error"),
+        ]
     if has_cubes:
         models = result.models()
         parts |= {"MODELS": models, "RESIDUALS": result._residuals(models)}

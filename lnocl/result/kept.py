@@ -94,7 +94,9 @@ def from_parts(
     has_prior = bool(_part(parts, "penalty.stars."))
     prior = _built(StarPrior, parts, "penalty.stars.") if has_prior else None
     with ignored_warnings():  # which the run has given
-        scene = setup.scene(_built(Penalty, parts, "penalty.", stars=prior))
+        shares = parts["penalty.shares"]  # text where there are none
+        known = {"stars": prior, "shares": tuple(shares.tolist()) if shares.ndim else ()}
+        scene = setup.scene(_built(Penalty, parts, "penalty.", **known))
         if setup.refine_positions and scene.n_stars:
             scene.move_stars(parts["positions"])
     return _built(

@@ -101,7 +101,9 @@ def summary_lines(result: Result, unit: Unit | None = None, is_warned: bool = Fa
     curves = _light_curves(result, unit)
     rows = [] if curves else _star_rows(result, unit)
     rows += result._halo_rows()
-    rows.append(("extended", f"{unit.flux(*result.extended_flux)} in the frame"))
+    names = result.component_names or ("extended",)
+    for name, flux, error in zip(names, *map(np.atleast_1d, result.extended_flux), strict=True):
+        rows.append((name, f"{unit.flux(flux, error)} in the frame"))
     verdict, *more = _trust(result, unit, is_warned)
     rows += [("trust", verdict), *(("", each) for each in more)]
     return [*curves, *_aligned(rows), _end(result)]
@@ -135,7 +137,7 @@ def details(result: Result) -> list[str]:
 
 def _star_rows(result: Result, unit: Unit) -> list[tuple[str, str]]:
     """Return label and flux of each star, of one epoch or of several."""
-    n, shown = result._observation.n_epochs, []
+    n, shown, word = result._observation.n_epochs, [], result._observation.epoch_word
     stars = result.star_positions[::n], result.star_fluxes, result.star_flux_errors
     fluxes, errors = (np.reshape(each, (-1, n)) for each in stars[1:])
     for k, (place, flux, error) in enumerate(zip(stars[0], fluxes, errors, strict=True), 1):
@@ -148,7 +150,7 @@ def _star_rows(result: Result, unit: Unit) -> list[tuple[str, str]]:
                 with_error(end(flux[seen]) / unit.electrons, middle / unit.electrons).split(" +- ")
                 for end in (np.min, np.max)
             )
-            words = f"{low[0]} to {' +- '.join(high)} {unit.name} in {seen.sum()} epochs"
+            words = f"{low[0]} to {' +- '.join(high)} {unit.name} in {seen.sum()} {word}s"
         shown.append((f"star {k} {_rounded(place)}", words))
     n_more = len(shown) - MAX_LISTED
     return shown if n_more <= 1 else [*shown[:MAX_LISTED], (f"{n_more} more stars", "in its table")]
@@ -157,16 +159,18 @@ def _star_rows(result: Result, unit: Unit) -> list[tuple[str, str]]:
 def _light_curves(result: Result, unit: Unit) -> list[str]:
     """Return a table with a row for each epoch and a column for each star, if they are few.
 
-    Errors of epochs are those of the changes; that of the mean holds what all epochs share.
+    Errors of epochs are those of the changes; that of the mean holds what all epochs share. With
+    several components rows are of filters, whose fluxes have no mean.
     """
     n = result._observation.n_epochs
     n_stars = len(result.star_fluxes) // n
     if not (1 < n <= MAX_LISTED and 0 < n_stars <= MAX_COLUMNS):
         return []
-    columns = [["epoch", *result._observation.epoch_labels, "mean"]]
+    is_one, labels = not result.component_names, result._observation.epoch_labels
+    columns = [["epoch" if is_one else "images of", *labels, *["mean"] * is_one]]
+    own_errors = result.star_variation_errors if is_one else result.star_flux_errors
     fluxes, errors = (
-        np.reshape(each, (n_stars, n)) / unit.electrons
-        for each in (result.star_fluxes, result.star_variation_errors)
+        np.reshape(each, (n_stars, n)) / unit.electrons for each in (result.star_fluxes, own_errors)
     )
     for k, place in enumerate(result.star_positions[::n]):
         pairs, seen = zip(fluxes[k], errors[k], strict=True), np.isfinite(fluxes[k])
@@ -174,14 +178,15 @@ def _light_curves(result: Result, unit: Unit) -> list[str]:
         if seen.any():
             shared = result.star_flux_covariances[k][np.ix_(seen, seen)].mean()
             mean = with_error(fluxes[k][seen].mean(), np.sqrt(shared) / unit.electrons)
-        columns.append([f"star {k + 1} {_rounded(place)}", *(with_error(*x) for x in pairs), mean])
+        rows = [*(with_error(*pair) for pair in pairs), *[mean] * is_one]
+        columns.append([f"star {k + 1} {_rounded(place)}", *rows])
     widths = [max(map(len, column)) for column in columns]
-    rows = [
+    lines = [
         "  ".join(f"{cell:>{width}}" for cell, width in zip(row, widths, strict=True))
         for row in zip(*columns, strict=True)
     ]
-    rows[0] += f"  {unit.name}, errors of epochs against the mean"
-    return rows
+    lines[0] += f"  {unit.name}" + ", errors of epochs against the mean" * is_one
+    return lines
 
 
 def _trust(result: Result, unit: Unit, is_warned: bool) -> Iterator[str]:
@@ -231,8 +236,10 @@ def _unnamed(result: Result, unit: Unit) -> Iterator[str]:
     background = float((levels / _areas(observation)).sum())
     # Of all images, whose noise tells.
     exposure = float(means(observation.exposure, observation.mask).sum())
-    found = sharp_sources(result.extended * exposure, background, observation.oversample)
-    found = found / (1.0, 1.0, exposure)
+    skies = result.extended.reshape(-1, *result.extended.shape[-2:]) * exposure
+    each = (sharp_sources(sky, background, observation.oversample) for sky in skies)
+    found = np.concatenate(list(each)) / (1.0, 1.0, exposure)
+    found = found[np.argsort(-found[:, 2])]
     offsets = found[:, None, :2] - result.star_positions
     found = found[(np.hypot(*np.moveaxis(offsets, -1, 0)) > MAX_SHIFT).all(axis=1)]
     if len(found):
@@ -247,7 +254,7 @@ def _unnamed(result: Result, unit: Unit) -> Iterator[str]:
 def _floor(result: Result, unit: Unit) -> Iterator[str]:
     """Yield a line where the extended source is nowhere dark."""
     observation = result._observation
-    darkest = float(np.quantile(result.extended, DARK_SHARE))
+    darkest = float(np.quantile(result.extended, DARK_SHARE, axis=(-2, -1)).max())
     counts = darkest * _areas(observation) * means(observation.exposure, observation.mask)
     levels = means(observation.background, observation.mask)
     if (counts > FLOOR * np.sqrt(levels + counts)).any():

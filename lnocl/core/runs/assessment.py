@@ -68,12 +68,21 @@ def assess(
     NotFiniteError
         Estimates are infinite or not a number.
     """
-    inside = tuple(map(slice, shape))
+
+    def products(a: NDArray[np.floating], b: NDArray[np.floating]) -> Array:
+        ny, nx = shape
+        rows = np.einsum("...yx,...yx->...y", a[..., :ny, :nx], b[..., :ny, :nx])
+        return np.asarray(rows.sum(axis=-1, dtype=np.float64))
 
     def product(a: NDArray[np.floating], b: NDArray[np.floating]) -> float:
-        return float(np.einsum("yx,yx->y", a[inside], b[inside]).sum(dtype=np.float64))
+        return float((products(a, b) * weights).sum())
 
     a_last, b_last = reference.extended
+    weights = np.ones(a_last.shape[:-2])
+    if weights.ndim:  # the noise of each sky counts alike, however bright it is
+        difference = a_last - b_last
+        noise_of = products(difference, difference)
+        weights = noise_of.max() / np.maximum(noise_of, np.finfo(np.float32).eps * noise_of.max())
     excess, noise = np.zeros((2, len(snapshots)))
     for k, snapshot in enumerate(snapshots):
         a, b = snapshot.extended

@@ -13,10 +13,17 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from lnocl.core.runs.outcome import Outcome
-from lnocl.core.runs.quantities import Part, Quantity, in_electrons, measure, quantities_of
+from lnocl.core.runs.quantities import (
+    Part,
+    Quantity,
+    in_electrons,
+    measure,
+    measure_part,
+    quantities_of,
+)
 from lnocl.core.runs.repeated import RerunWithCounts
 from lnocl.core.runs.replicas import Replica, Replicas
-from lnocl.core.scene.apertures import AMOUNT, FLUX, FWHM, Aperture
+from lnocl.core.scene.apertures import AMOUNT, FLUX, FWHM, RATIO, Aperture
 from lnocl.core.scene.arrays import Array, whole
 from lnocl.core.scene.texture import resolution
 from lnocl.errors import InputError
@@ -247,7 +254,7 @@ class Bootstrap:
             columns["error_psf"] = self.of_psfs.std(axis=0, ddof=1)
         if np.any(self.of_smoothing):
             columns["error_smoothing"] = self._least
-        units = {FLUX: unit or self.unit, AMOUNT: "electron"}
+        units = {FLUX: unit or self.unit, AMOUNT: "electron", RATIO: ""}
         for level in LEVELS:
             low, high = self.interval(level)
             columns |= {f"low{level * 100:.0f}": low, f"high{level * 100:.0f}": high}
@@ -333,7 +340,7 @@ def without_replicas(outcome: Outcome, parts: Sequence[Part], seed: int) -> Boot
     errors, is_shown = outcome.star_errors(), outcome.scene.is_shown[: outcome.scene.n_stars]
     positions = errors.positions[is_shown & outcome.moves].ravel()
     stated = np.nan_to_num(np.append(in_electrons(outcome, errors.fluxes), positions))
-    pixels = np.zeros((3, *outcome.scene.observation.sky_shape))
+    pixels = np.zeros((3, *outcome.scene.observation.skies_shape))
     none = np.zeros((0, len(quantities)))
     unit = "electron/s" if outcome.setup.is_rate else "electron"
     return Bootstrap(quantities, none, none, pixels, width, seed, unit, stated, shares)
@@ -342,15 +349,17 @@ def without_replicas(outcome: Outcome, parts: Sequence[Part], seed: int) -> Boot
 def _changed_by_smoothing(outcome: Outcome, parts: Sequence[Part], values: Array) -> Array:
     """Return the light of regions less that without smoothing, 0 for other quantities, (k,)."""
     penalty, changed = outcome.scene.penalty, np.zeros(len(values))
-    is_region = [isinstance(part, Aperture) for part in parts for _ in part.labels()]
+    is_region = [isinstance(part, Aperture) for part in parts]
     if any(is_region) and (penalty.smoothing or penalty.near_stars is not None):
         sharp = replace(penalty, smoothing=0.0, near_stars=None)
         given = outcome.scene.observation.images, penalty.stars
         (other,) = RerunWithCounts(outcome, penalty=sharp).of(given)
         light = other.light().sky()
-        there = np.concatenate([part.measure(other.estimate.observed_sky, light) for part in parts])
-        of_parts = slice(len(values) - len(there), None)
-        changed[of_parts] = np.where(is_region, values[of_parts] - there, 0.0)
+        names, sky = outcome.scene.observation.component_names, other.estimate.observed_sky
+        found = [measure_part(part, sky, light, names) for part in parts]
+        of_regions = np.repeat(is_region, list(map(len, found)))
+        of_parts = slice(len(values) - len(of_regions), None)
+        changed[of_parts] = np.where(of_regions, values[of_parts] - np.concatenate(found), 0.0)
     return changed
 
 
@@ -396,7 +405,8 @@ class _Measuring:
         """Return a sky at the resolution."""
         from scipy.ndimage import gaussian_filter
 
-        return np.asarray(gaussian_filter(sky, self._width / FWHM, mode="nearest"))
+        widths = [0.0] * (sky.ndim - 2) + [self._width / FWHM] * 2
+        return np.asarray(gaussian_filter(sky, widths, mode="nearest"))
 
     def __call__(self, numbers: Sequence[int]) -> list[_Measured]:
         return list(map(self._measure, self._replicas.reconstruct(*numbers)))

@@ -29,7 +29,7 @@ def settle_halos(start: Start) -> Start:
     if not (start.setup.settles_halos and start.scene.n_halos):
         return start
     with ignored_warnings(), ignored_notes():  # those of the reconstruction are the same
-        found = marginal_halos(_short_run(start.setup))
+        found = _short_run(start.setup).changed(marginal_halos)
     return hold_halos(start, found)
 
 
@@ -48,7 +48,7 @@ def hold_halos(start: Start, found: Estimate) -> Start:
 def settle_levels(setup: Setup) -> Setup:
     """Return a setup with the levels of the background that are fitted after a short run."""
     with ignored_warnings(), ignored_notes():
-        found = fit_levels(_short_run(setup))
+        found = _short_run(setup).changed(fit_levels)
     return replace(setup, observation=found.scene.observation)
 
 

@@ -34,6 +34,8 @@ def describe(setup: Setup, **parameters: Any) -> dict[str, str]:
 def inputs_of(observation: Observation) -> dict[str, Any]:
     """Return the parameters of an observation, by their names."""
     bound = {name: getattr(observation, name) for name in (*FIELDS, "offsets", "turns")}
+    if observation.component_names:
+        bound["component_names"] = "; ".join(observation.component_names)
     if observation.psf_fields:
         bound["psf_fields"] = np.concatenate([each.numbers() for each in observation.psf_fields])
     return bound

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,12 +17,12 @@ from lnocl.core.scene.estimate import Estimate
 from lnocl.core.scene.observation import Observation
 from lnocl.core.scene.scene import Scene
 from lnocl.core.scene.stars import MAX_SHIFT
-from lnocl.errors import in_words, warn
+from lnocl.errors import InputError, in_words, warn
 from lnocl.residuals import MUCH_EXCHANGED, StarResiduals, judge_stars
 
 if TYPE_CHECKING:
     from lnocl.core.solvers.levels import Levels
-    from lnocl.core.solvers.light import Light
+    from lnocl.core.solvers.light import Light, LightOfComponents
 
 CURVE_DTYPE = np.dtype([("smoothing", np.float64), ("iteration", np.int64), ("error", np.float64)])
 
@@ -94,6 +94,17 @@ class PsfRefinement:
     hidden_error: float = 0.0
 
 
+def worst(refinements: Sequence[PsfRefinement], n_skies: int) -> PsfRefinement:
+    """Return the refinement of the filter whose PSFs have the largest error, for several skies."""
+    found = max(refinements, key=lambda each: each.psf_error)
+    return replace(
+        found,
+        is_accepted=any(each.is_accepted for each in refinements),
+        may_be_faked=np.broadcast_to(found.may_be_faked, (n_skies, *found.may_be_faked.shape)),
+        hidden_error=max(each.hidden_error for each in refinements),
+    )
+
+
 class Mended(NamedTuple):
     """A setup whose PSFs and positions fit as well as could be found.
 
@@ -132,20 +143,23 @@ def marginalise(estimate: Estimate, stars: bool, halos: bool, levels: bool) -> E
     """Return the estimate with levels, halos and stars marginal where wanted.
 
     `lnocl.core.solvers.levels`, `lnocl.core.solvers.halos` and `lnocl.core.solvers.marginal` have
-    the equations.
+    the equations. Of several skies this is done for what each filter shows.
     """
+    wanted = list[Callable[[Estimate], Estimate]]()
     if levels:
         from lnocl.core.solvers.levels import fit_levels
 
-        estimate = fit_levels(estimate)
+        wanted.append(fit_levels)
     if halos:
         from lnocl.core.solvers.halos import marginal_halos
 
-        estimate = marginal_halos(estimate)
+        wanted.append(marginal_halos)
     if stars:
         from lnocl.core.solvers.marginal import marginal
 
-        estimate = marginal(estimate)
+        wanted.append(marginal)
+    for change in wanted:
+        estimate = estimate.changed(change)
     return estimate
 
 
@@ -234,6 +248,49 @@ class Outcome:
             has_levels=levels,
         )
 
+    def of_filter(self, label: str | None) -> Outcome:
+        """Return what the images of a filter show of several skies, as the outcome of one sky.
+
+        Parameters
+        ----------
+        label : str or None
+            The name of the filter, such as "line + continuum"; None where there is one sky.
+
+        Raises
+        ------
+        InputError
+            There is no such filter, or there are several.
+        """
+        mixing, observation = self.scene.mixing, self.scene.observation
+        if mixing is None and label is None:
+            return self
+        names = observation.filter_names
+        if mixing is None or label not in names:
+            known = " or ".join(map(repr, names)) or "None, as there is one sky"
+            raise InputError(f"`images_of` is {label!r}; give {known}")
+        g = names.index(label)
+        part, row, penalty = self.estimate.parts[g], mixing.rows[g], self.scene.penalty
+        shares = np.array(penalty.shares or [1.0] * len(row))
+        near, refinement = penalty.near_stars, self.psf_refinement
+        own = replace(
+            penalty,
+            smoothing=penalty.smoothing * float(np.hypot.reduce(row * shares)),
+            near_stars=None if near is None else np.sqrt(np.einsum("k,kyx->yx", row, near**2)),
+            shares=(),
+            spectral=0.0,
+            stars=None,
+        )
+        if refinement is not None:
+            refinement = replace(refinement, may_be_faked=refinement.may_be_faked[0])
+        images = observation.of_images(part.images)
+        setup = replace(self.setup, observation=images, pad=self.scene.pad, initial_extended=None)
+        return replace(
+            self,
+            setup=replace(setup, initial_star_fluxes=None),
+            estimate=replace(part.estimate, scene=part.estimate.scene.penalised(own)),
+            psf_refinement=refinement,
+        )
+
     def halo_amounts(self, fluxes: Array) -> Array:
         """Return those of fluxes that are of halos, electrons of each image, shape (n_halos, p)."""
         halo_amounts = fluxes[self.scene.n_stars :] * self.scene.mean_exposure
@@ -254,35 +311,45 @@ class Outcome:
         """Return how well the model fits at each star, and what it may exchange with a host."""
         from lnocl.core.solvers.exchange import exchanged  # which loads scipy
 
-        shares = exchanged(self.estimate, MUCH_EXCHANGED).tolist()
-        pairs = zip(judge_stars(self.estimate), shares, strict=True)
-        return [each._replace(exchanged=share) for each, share in pairs]
+        found = dict[int, StarResiduals]()
+        for part in self.estimate.parts:
+            shares = exchanged(part.estimate, MUCH_EXCHANGED).tolist()
+            judged = zip(part.fluxes.tolist(), judge_stars(part.estimate), shares, strict=False)
+            found |= {s: each._replace(exchanged=share) for s, each, share in judged}
+        return [found[s] for s in sorted(found)]
 
-    def extended_flux(self, star_flux_errors: Array) -> tuple[float, float]:
-        """Return the light of the extended source and its standard error, electrons."""
+    def extended_flux(self, star_flux_errors: Array) -> tuple[Any, Any]:
+        """Return the light of the extended source and its standard error, electrons.
+
+        With several skies they are arrays of shape (K,).
+        """
         whole = np.broadcast_to(1.0, self.observation.sky_shape)
         return self.light().flux(whole, star_flux_errors)
 
-    def light(self) -> Light:
+    def light(self) -> Light | LightOfComponents:
         """Return the light of the extended source without bias."""
-        from lnocl.core.solvers.light import Light  # which loads scipy
+        from lnocl.core.solvers.light import Light, LightOfComponents  # which loads scipy
 
-        return Light(self.estimate, self.levels)
+        pairs = zip(self.estimate.parts, self.levels, strict=True)
+        lights = [Light(part.estimate, levels) for part, levels in pairs]
+        return lights[0] if self.scene.mixing is None else LightOfComponents(self.estimate, lights)
 
     @cached_property
-    def levels(self) -> Levels | None:
-        """The levels of the background, where they are not known."""
+    def levels(self) -> list[Levels | None]:
+        """The levels of the background of each filter's images; None where they are known."""
         if not self.scene.observation.background_error.any():
-            return None
+            return [None] * len(self.estimate.parts)
         from lnocl.core.solvers.levels import Levels  # which loads scipy
 
-        return Levels(self.estimate, self.has_levels)
+        return [Levels(part.estimate, self.has_levels) for part in self.estimate.parts]
 
     def levels_in_words(self) -> list[str]:
         """Return the level of each image whose background was fitted, electrons per pixel."""
-        if self.levels is None or not self.has_levels:
+        if not self.has_levels:
             return []
-        observation = self.scene.observation
+        observation, errors = self.scene.observation, np.zeros(self.scene.n_images)
+        for part, of_part in zip(self.estimate.parts, self.levels, strict=True):
+            errors[list(part.images)] = 0.0 if of_part is None else of_part.errors[:, 0]
         levels, noise = (
             means(each, observation.mask)
             for each in (observation.background, observation.read_noise**2)
@@ -291,7 +358,7 @@ class Outcome:
         return [
             f"`images[{j}]`: background {levels[j]:.6g} +- {error:.2g} electrons per pixel, fitted "
             "with the rest"
-            for j, error in enumerate(self.levels.errors[:, 0])
+            for j, error in enumerate(errors)
             if error > 0
         ]
 
@@ -309,13 +376,26 @@ class Outcome:
         LnoclWarning
             The images do not determine flux and position of a star, or the amount of a halo.
         """
+        n, n_epochs = self.scene.n_stars, self.scene.n_epochs
+        fluxes, positions = np.full(self.scene.n_fluxes, np.nan), np.full((n, 2), np.nan)
+        covariances = np.zeros((n // n_epochs, n_epochs, n_epochs))
+        for part, levels in zip(self.estimate.parts, self.levels, strict=True):
+            found, own = self._errors_of(part.estimate, levels), part.fluxes
+            stars = own[own < n]
+            fluxes[own], positions[stars] = found.fluxes, found.positions
+            epochs = np.unique(stars % n_epochs)
+            covariances[:, epochs[:, None], epochs] = found.covariances
+        return StarErrors(fluxes, positions, covariances)
+
+    def _errors_of(self, estimate: Estimate, levels: Levels | None) -> StarErrors:
+        """Return the errors of a part of the estimate."""
         from lnocl.core.solvers.halos import halo_errors
         from lnocl.core.solvers.star_errors import add_apart, standard_errors, without_source
 
-        scene, moves, halos = self.scene, self.moves, halo_errors(self.estimate)
-        star_fluxes = self.star_fluxes[: scene.n_stars]
-        errors, covariances = standard_errors(self.estimate, moves, halos.raised, self.levels)
-        more = without_source(self.estimate, halos.raised)
+        scene, moves, halos = estimate.scene, self.moves, halo_errors(estimate)
+        star_fluxes = estimate.star_fluxes[: scene.n_stars]
+        errors, covariances = standard_errors(estimate, moves, halos.raised, levels)
+        more = without_source(estimate, halos.raised)
         is_lost = np.isnan(errors[:, : 3 if moves else 1]).any(axis=1) & (star_fluxes > 0)
         _warn_of_undetermined(scene.stars[is_lost], bool(np.isnan(halos.errors).any()))
         if self.psf_refinement is not None:

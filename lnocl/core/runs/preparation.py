@@ -10,13 +10,14 @@ from typing import Any
 import numpy as np
 
 from lnocl.core.runs.options import StopName
-from lnocl.core.runs.outcome import Mended, PsfRefinement
+from lnocl.core.runs.outcome import Mended, PsfRefinement, worst
 from lnocl.core.runs.plan import AUTO, CORES, EXPOSURES, LEVELS, PLACES, PSFS, RAYS, Plan
 from lnocl.core.runs.start import Setup
 from lnocl.core.runs.steady import STEADY, steady_penalty
 from lnocl.core.scene.arrays import Array
+from lnocl.core.scene.components import Mixing
 from lnocl.core.scene.observation import Observation
-from lnocl.core.scene.penalty import Penalty, recommend_smoothing
+from lnocl.core.scene.penalty import Penalty, recommend_smoothing, shares_of_skies
 from lnocl.errors import NotFiniteError, detail
 from lnocl.progress import Progress
 
@@ -79,12 +80,7 @@ def quietly() -> np.errstate:
 def prepare(plan: Plan, progress: bool = False) -> Prepared:
     """Return the run of a plan, after levels are fitted and PSFs and positions judged."""
     setup, found = _mend_images(plan)
-    if plan.does(LEVELS):
-        from lnocl.core.runs.halos import settle_levels  # which loads scipy
-
-        with quietly(), Progress(None, "", bool(progress), "fitting levels"):
-            setup = settle_levels(setup)
-    mended = _judge_psfs(plan, setup, progress) if plan.does(PSFS) else Mended(setup)
+    mended = _mended(plan, setup, progress)
     is_auto, stop = AUTO.holds(plan) and plan.does(PSFS), plan.stop
     are_wrong = is_auto and mended.near_stars is not None and not mended.fits
     penalties = _penalties(plan, mended, are_wrong)
@@ -92,6 +88,57 @@ def prepare(plan: Plan, progress: bool = False) -> Prepared:
         stop = CONVERGED
     of_psfs = steady_penalty(penalties), mended.refinement, is_auto and mended.is_within
     return Prepared(mended.setup, penalties, plan.n_iter, stop, *of_psfs, found)
+
+
+def _mended(plan: Plan, setup: Setup, progress: bool) -> Mended:
+    """Return a setup with levels fitted and PSFs judged: of several skies, filter by filter.
+
+    What the images of a filter show is one sky.
+    """
+    observation = setup.observation
+    if not (observation.component_names and (plan.does(LEVELS) or plan.does(PSFS))):
+        if plan.does(LEVELS):
+            from lnocl.core.runs.halos import settle_levels  # which loads scipy
+
+            with quietly(), Progress(None, "", bool(progress), "fitting levels"):
+                setup = settle_levels(setup)
+        return _judge_psfs(plan, setup, progress) if plan.does(PSFS) else Mended(setup)
+    found, mixing = list[Mended](), observation.mixing
+    images = [mixing.images_of(g) for g in range(len(mixing.rows))]
+    for which in images:
+        own = replace(setup, observation=observation.of_images(which), initial_extended=None)
+        own = replace(own, initial_star_fluxes=None)
+        families = plan.families
+        if len(which) == 1 and not plan.is_asked:  # whose place is that of its stars
+            families = tuple(name for name in families if name != "shift")
+        found.append(_mended(replace(plan, setup=own, families=families), own, progress))
+    return _joined(setup, mixing, images, found)
+
+
+def _joined(
+    setup: Setup, mixing: Mixing, images: Sequence[Sequence[int]], found: Sequence[Mended]
+) -> Mended:
+    """Return the setup of all images, with what was mended of those of each filter.
+
+    The error of PSFs asks each sky to be smoothed by the root of the sum of squares of what it asks
+    of what filters show, times their weights.
+    """
+    mended = [each.setup.observation for each in found]
+    observation = setup.observation.joined(list(zip(images, mended, strict=True)))
+    moves = any(each.setup.refine_positions for each in found)
+    near = [each.near_stars for each in found]
+    near_stars, shape = None, observation.sky_shape
+    if any(each is not None for each in near):
+        squares = [np.zeros(shape) if each is None else each**2 for each in near]
+        near_stars = np.sqrt(np.einsum("gk,gyx->kyx", mixing.rows**2, np.array(squares)))
+    refinements = [each.refinement for each in found if each.refinement is not None]
+    return Mended(
+        replace(setup, observation=observation, refine_positions=moves),
+        worst(refinements, setup.observation.n_skies) if refinements else None,
+        near_stars,
+        all(each.fits for each in found),
+        all(each.is_within for each in found),
+    )
 
 
 def _mend_images(plan: Plan) -> tuple[Setup, dict[str, str]]:
@@ -139,7 +186,8 @@ def _penalties(plan: Plan, mended: Mended, are_psfs_wrong: bool) -> list[Penalty
     """Return the penalty, or those from which held-out counts choose."""
     if not isinstance(plan.smoothing, str):
         return [Penalty(plan.mu, plan.smoothing)]
-    recommended = recommend_smoothing(mended.setup.observation)
+    observation = mended.setup.observation
+    recommended, shares = recommend_smoothing(observation), shares_of_skies(observation)
     multiples: Sequence[float] = (1.0,)
     reason = "the noise of the counts"
     if are_psfs_wrong:
@@ -147,7 +195,8 @@ def _penalties(plan: Plan, mended: Mended, are_psfs_wrong: bool) -> list[Penalty
     elif plan.stop == "held-out":
         multiples, reason = (0.0, *MULTIPLES), ""
     weights = (each * recommended for each in multiples)
-    penalties = [Penalty(plan.mu, each, near_stars=mended.near_stars) for each in weights]
+    near = mended.near_stars
+    penalties = [Penalty(plan.mu, each, near_stars=near, shares=shares) for each in weights]
     if reason:
         detail(f"`smoothing` chosen: {penalties[0].in_words()}, by {reason}")
     return penalties

@@ -9,7 +9,7 @@ import numpy as np
 
 from lnocl.core.runs.outcome import Outcome
 from lnocl.core.runs.replicas import Sky
-from lnocl.core.scene.apertures import AMOUNT, FLUX, LENGTH, Aperture, Label, Profile
+from lnocl.core.scene.apertures import AMOUNT, FLUX, LENGTH, RATIO, Aperture, Label, Profile
 from lnocl.core.scene.arrays import Array
 from lnocl.core.scene.detector import on_sky
 from lnocl.core.scene.forward_model import Model
@@ -21,6 +21,9 @@ BELOW, UNDER, UNSEEN = "below the resolution", "under a star", "not observed"
 
 Part = Aperture | Profile
 
+# The component that the light of others is compared with.
+CONTINUUM = "continuum"
+
 
 class Quantity(NamedTuple):
     """A quantity whose error a bootstrap estimates.
@@ -31,7 +34,7 @@ class Quantity(NamedTuple):
         Its name, such as "star 1 flux".
     kind : str
         "flux", in electrons, per second where exposures were given; "halo", in electrons of one
-        image; "length", a position or a width, in pixels.
+        image; "length", a position or a width, in pixels; "ratio", of the light of two components.
     value : float
         Its value in the reconstruction.
     note : str
@@ -58,9 +61,26 @@ def measure(outcome: Outcome, sky: Sky, parts: Sequence[Part]) -> Array:
     fluxes = in_electrons(outcome, sky.star_fluxes)
     shown = outcome.scene.is_shown[: outcome.scene.n_stars]
     positions = sky.star_positions[shown].ravel() if outcome.moves else np.zeros(0)
-    return np.concatenate(
-        [fluxes, positions, *(part.measure(sky.extended, sky.light) for part in parts)]
-    )
+    named = outcome.scene.observation.component_names
+    of_parts = (measure_part(part, sky.extended, sky.light, named) for part in parts)
+    return np.concatenate([fluxes, positions, *of_parts])
+
+
+def measure_part(part: Part, extended: Array, light: Array, names: Sequence[str]) -> Array:
+    """Return what a part has of a sky, or of each of several, and then the ratios of these."""
+    if not names:
+        return part.measure(extended, light)
+    found = np.array([part.measure(*each) for each in zip(extended, light, strict=True)])
+    ratios = [found[k, 0] / (found[m, 0] or np.nan) for k, m in _compared(part, names)]
+    return np.append(found, ratios)
+
+
+def _compared(part: Part, names: Sequence[str]) -> list[tuple[int, int]]:
+    """Return which components' light in a region is divided by which: all by the continuum's."""
+    if isinstance(part, Profile) or CONTINUUM not in names:
+        return []
+    m = names.index(CONTINUUM)
+    return [(k, m) for k in range(len(names)) if k != m]
 
 
 def in_electrons(outcome: Outcome, fluxes: Array) -> Array:
@@ -90,6 +110,7 @@ def quantities_of(
     if parts:
         observed = _observed(scene)
         cutouts = [[scene.psf_on_sky(j, s) for j in images] for s in shown]
+    names = scene.observation.component_names
     for part in parts:
         own, slices = part.labels(), part.slices if isinstance(part, Profile) else [part]
         held = np.zeros((len(own), n_stated))  # widths hold no light
@@ -98,8 +119,15 @@ def quantities_of(
         own_notes = [_note(each, scene, width, observed) for each in slices]
         if isinstance(part, Aperture) and part.n_pixels < np.pi / 4.0 * width**2:
             own_notes = [BELOW]
-        notes += own_notes * (len(own) // len(slices))
-        labels, shares = labels + own, [*shares, *held]
+        own_notes *= len(own) // len(slices)
+        for name, of_filters in zip(names or [""], _shares_of_filters(scene, shown), strict=True):
+            named = [each._replace(name=f"{name} {each.name}".lstrip()) for each in own]
+            labels, notes = labels + named, notes + own_notes
+            filled = np.append(of_filters, np.zeros(n_stated - len(shown)))
+            shares = [*shares, *(held * filled)]
+        for k, m in _compared(part, names):
+            labels = [*labels, Label(f"{names[k]} / {names[m]} {part.name}", RATIO)]
+            notes, shares = notes + own_notes[:1], [*shares, np.zeros(n_stated)]
     light = outcome.light().sky() if parts else outcome.sky
     sky = Sky(outcome.estimate.observed_sky, light, outcome.star_fluxes, scene.stars)
     values = measure(outcome, sky, parts).tolist()
@@ -108,6 +136,14 @@ def quantities_of(
         for label, value, note in zip(labels, values, notes, strict=True)
     )
     return quantities, np.reshape(shares, (len(labels), n_stated))
+
+
+def _shares_of_filters(scene: Scene, shown: Sequence[int]) -> Array:
+    """Return by how much the light of each star, in its filter, is in each sky, (K, n)."""
+    if scene.mixing is None:
+        return np.ones((1, len(shown)))
+    filters = scene.mixing.filters[scene.shown[list(shown)].argmax(axis=1)]
+    return scene.mixing.undone[:, filters]
 
 
 def _light_within(aperture: Aperture, cutouts: Sequence[Cutout], grid: tuple[int, int]) -> float:
@@ -123,9 +159,10 @@ def _observed(scene: Scene) -> Array:
     observed = np.ones(scene.grid)
     if scene.weights is not None:
         model = Model(scene)
-        observed *= scene.observed(model.adjoint(model.weights))
+        observed = observed * scene.observed(model.adjoint(model.weights))
     ny, nx = scene.observation.sky_shape
-    return observed[:ny, :nx]
+    seen = observed if observed.ndim == 2 else observed.min(axis=0)
+    return seen[:ny, :nx]
 
 
 def _note(aperture: Aperture, scene: Scene, width: float, observed: Array) -> str:

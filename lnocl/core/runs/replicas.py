@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from copy import copy
+from dataclasses import replace
 from typing import NamedTuple, cast
 
 import numpy as np
@@ -12,13 +13,13 @@ import numpy as np
 from lnocl.core.runs.outcome import Outcome, marginalise
 from lnocl.core.runs.repeated import RerunWithCounts
 from lnocl.core.scene.arrays import Array
+from lnocl.core.scene.components import Mixing
 from lnocl.core.scene.estimate import Estimate
 from lnocl.core.scene.forward_model import Model
 from lnocl.core.scene.psf_field import Psfs, mapped
 from lnocl.core.scene.psf_pixels import PsfPixels
 from lnocl.core.scene.star_prior import StarPrior
 from lnocl.core.scene.texture import Texture, hidden_radii, resolution
-from lnocl.core.solvers.light import Light
 
 # Counts, shape (p, ny, nx), and a prior of the stars.
 Given = tuple[Array, StarPrior | None]
@@ -78,9 +79,10 @@ class Replicas:
     def __init__(self, outcome: Outcome, seed: int, n: int = 1) -> None:
         self._outcome, self._seed, scene = outcome, seed, outcome.scene
         width = resolution(scene)
-        self._texture = Texture(
-            outcome.estimate.extended, scene.shown_stars, width, hidden_radii(scene, width)
-        )
+        stars, hidden = scene.shown_stars, hidden_radii(scene, width)
+        self._textures = [
+            Texture(sky, stars, width, hidden) for sky in _skies(outcome.estimate.extended)
+        ]
         self._model = Model(scene)
         observation = scene.observation
         self._added = observation.read_noise**2
@@ -107,12 +109,14 @@ class Replicas:
     def _observe(self, k: int) -> tuple[Sky, Given, Given | None]:
         """Return the sky of a replica, counts and prior, and those where the PSFs are wrong too."""
         scene = self._outcome.scene
-        of_sky, of_psfs, *of_images, of_prior = np.random.SeedSequence([self._seed, k]).spawn(
-            scene.n_images + 3
-        )
-        sky = self._texture.draw(np.random.default_rng(of_sky))
+        seeds = np.random.SeedSequence([self._seed, k]).spawn(scene.n_images + 4)
+        of_sky, of_psfs, *of_images, of_prior, of_weights = seeds
+        rng = np.random.default_rng(of_sky)
+        drawn_skies = [texture.draw(rng) for texture in self._textures]
+        sky = np.reshape(drawn_skies, scene.sky_grid)
         estimate = Estimate.of_scaled(scene, sky, self._outcome.estimate.fluxes)
-        models = list(self._means(self._model, sky))
+        model = self._mixed_otherwise(self._model, np.random.default_rng(of_weights))
+        models = list(self._means(model, sky))
         drawn = Sky(estimate.observed_sky, *self._without_noise(estimate, models), scene.stars)
         counts = self._draw(models, of_images)
         prior, star_fluxes = scene.penalty.stars, self._outcome.star_fluxes
@@ -123,6 +127,18 @@ class Replicas:
         # The same noise: counts that are drawn of almost the same mean may be quite others.
         changed = [n + b - a for n, a, b in zip(counts, models, others, strict=True)]
         return drawn, (counts, prior), (np.maximum(changed, 0.0), prior)
+
+    def _mixed_otherwise(self, model: Model, rng: np.random.Generator) -> Model:
+        """Return a model with weights of components that are drawn from their errors."""
+        scene = model.scene
+        errors = scene.observation.component_errors
+        if scene.mixing is None or not errors.any():
+            return model
+        shifts = rng.standard_normal(scene.mixing.rows.shape)[scene.mixing.filters]
+        other = copy(model)
+        other.scene = copy(scene)
+        other.scene.mixing = Mixing.of(np.maximum(scene.mixing.weights + errors * shifts, 0.0))
+        return other
 
     def _without_noise(self, drawn: Estimate, models: Sequence[Array]) -> tuple[Array, Array]:
         """Return light and fluxes of a drawn sky, beside levels and halos fitted to its means.
@@ -136,8 +152,8 @@ class Replicas:
         scene = copy(drawn.scene)
         scene.observation = scene.observation.replace(images=models)
         seen = Estimate(scene, drawn.sky, drawn.star_fluxes)
-        fitted = marginalise(seen, False, halos, levels)
-        return Light(fitted).sky(), fitted.star_fluxes
+        fitted = replace(self._outcome, estimate=marginalise(seen, False, halos, levels))
+        return fitted.light().sky(), fitted.star_fluxes
 
     def _find(self, given: Iterable[Given]) -> list[Sky]:
         """Return the reconstructions of observations with these counts and priors."""
@@ -170,6 +186,11 @@ class Replicas:
         ny, nx = scene.observation.shape
         for j, image in enumerate(images):
             yield scene.in_electrons(image, j)[:ny, :nx]
+
+
+def _skies(extended: Array) -> Array:
+    """Return one sky or several as several, (K, Ny, Nx)."""
+    return extended.reshape(-1, *extended.shape[-2:])
 
 
 def _draw(model: Array, added: Array, seed: np.random.SeedSequence) -> Array:

@@ -70,8 +70,7 @@ def told_prior(outcome: Outcome) -> StarPrior:
 
     scene, fluxes = outcome.scene, outcome.star_fluxes
     errors = np.full(len(fluxes), np.nan)
-    found, _ = standard_errors(
-        outcome.estimate, outcome.moves, levels=outcome.levels, finished=FINISHED
-    )
-    errors[: scene.n_stars] = found[:, 0]
+    for part, levels in zip(outcome.estimate.parts, outcome.levels, strict=True):
+        found, _ = standard_errors(part.estimate, outcome.moves, levels=levels, finished=FINISHED)
+        errors[part.fluxes[part.fluxes < scene.n_stars]] = found[:, 0]
     return StarPrior.of(fluxes, errors)

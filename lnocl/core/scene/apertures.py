@@ -10,8 +10,9 @@ import numpy as np
 
 from lnocl.core.scene.arrays import Array
 
-# What is measured: light, in electrons, lengths, in pixels, or light of one image, in electrons.
-FLUX, LENGTH, AMOUNT = "flux", "length", "halo"
+# What is measured: light, in electrons, lengths, in pixels, light of one image, in electrons, or
+# how bright a component is over another.
+FLUX, LENGTH, AMOUNT, RATIO = "flux", "length", "halo", "ratio"
 # A full width at half maximum in standard deviations, of a Gaussian.
 FWHM = 2.0 * math.sqrt(2.0 * math.log(2.0))
 

@@ -6,8 +6,11 @@ changed into each other here alone.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
+from copy import copy
 from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,7 +27,7 @@ class Estimate:
     ----------
     scene : Scene
         What is modelled, with the stars where they are.
-    sky : ndarray, shape (Ny, Nx)
+    sky : ndarray, shape (Ny, Nx), or with several skies (K, Ny, Nx)
         Extended source on the grid, electrons per pixel of it.
     star_fluxes : ndarray of float64, shape (n_fluxes,)
         Of the stars and then of the halos, electrons.
@@ -57,10 +60,58 @@ class Estimate:
     def observed_sky(self) -> Array:
         """The part of the extended source that images show, of `Observation.sky_shape`."""
         ny, nx = self.scene.observation.sky_shape
-        return self.sky[:ny, :nx]
+        return self.sky[..., :ny, :nx]
+
+    @cached_property
+    def parts(self) -> list[Part]:
+        """What the images of each filter show, as one sky; this estimate where it has one."""
+        scene = self.scene
+        if scene.mixing is None:
+            return [Part(range(scene.n_images), np.arange(scene.n_fluxes), self)]
+        found = []
+        for g, sky in enumerate(scene.mixing.seen(self.sky)):
+            images = scene.mixing.images_of(g)
+            fluxes = scene.fluxes_of(images)
+            own = Estimate(scene.of_images(images), sky, self.star_fluxes[fluxes])
+            found.append(Part(images, fluxes, own))
+        return found
+
+    def changed(self, change: Callable[[Estimate], Estimate]) -> Estimate:
+        """Return the estimate whose parts are changed; skies are not below 0."""
+        mixing = self.scene.mixing
+        if mixing is None:
+            return change(self)
+        after, scene, fluxes = [], copy(self.scene), self.star_fluxes.copy()
+        for part in self.parts:
+            after.append(change(part.estimate))
+            fluxes[part.fluxes] = after[-1].star_fluxes
+        images = [part.images for part in self.parts]
+        observations = [each.scene.observation for each in after]
+        scene.observation = scene.observation.joined(list(zip(images, observations, strict=True)))
+        pairs = zip(after, self.parts, strict=True)
+        added = mixing.components([each.sky - part.estimate.sky for each, part in pairs])
+        return Estimate(scene, np.maximum(self.sky + added, 0.0), fluxes)
 
     def models(self) -> Iterator[Array]:
         """Yield the m_j on the grid of the images, scaled; one alone is held."""
         from lnocl.core.scene.forward_model import model_images  # which loads scipy
 
         return model_images(self.scene, self.extended, self.fluxes)
+
+
+class Part(NamedTuple):
+    """A part of an estimate.
+
+    Attributes
+    ----------
+    images : sequence of int
+        Its images.
+    fluxes : ndarray of int
+        Its fluxes, by their numbers among all.
+    estimate : Estimate
+        That of its sky and fluxes.
+    """
+
+    images: Sequence[int]
+    fluxes: NDArray[np.intp]
+    estimate: Estimate

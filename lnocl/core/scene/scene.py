@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from copy import copy
 from functools import cached_property
 from typing import Any
@@ -452,6 +452,40 @@ class Scene:
         other.shown, other.star_weights = self.shown[:n], self.star_weights[:n]
         other._halos, other.holds_halos = [], False
         other._field = other._place_stars(self.stars)
+        return other
+
+    def fluxes_of(self, which: Sequence[int]) -> NDArray[np.intp]:
+        """Return the fluxes of stars in the epochs of some images, and of the halos of these."""
+        epochs = np.unique(self.observation.epochs[list(which)])
+        stars = np.arange(self.n_stars).reshape(-1, self.n_epochs)[:, epochs].ravel()
+        halos = self.n_stars + np.arange(self.n_halos).reshape(-1, self.n_images)[:, which].ravel()
+        return np.append(stars, halos)
+
+    def of_images(self, which: Sequence[int]) -> Scene:
+        """Return this scene for some images of one filter, in the same units: it has one sky."""
+        other, which = copy(self), list(which)
+        vars(other).pop("rough_fit", None)
+        fluxes, n = self.fluxes_of(which), self.n_stars
+        stars = fluxes[fluxes < n]
+        other.observation = observation = self.observation.of_images(which)
+        other.mixing, other.sky_grid = None, self.grid
+        other.shown, other.star_weights = (
+            self.shown[fluxes][:, which],
+            self.star_weights[fluxes],
+        )
+        other.owned, other.gains = self.owned[stars], self.gains[which]
+        other.areas, other.seen_areas = self.areas[which], self.seen_areas[which]
+        for name in ("rotations", "_psfs", "_psfs_of_sky", "_responses_of_sky"):
+            if held := vars(self).get(name):
+                setattr(other, name, [held[j] for j in which])
+        if self.transmission is not None:
+            other.transmission = self.transmission[which]
+        if self.weights is not None:
+            other.weights = self.weights[which]
+        halos = fluxes[fluxes >= n] - n
+        other._halos = [[self._halos[j][k] for k in halos] for j in which] if self._halos else []
+        other._own = StarPsfs(observation, other.gains, other._movable, self.grid)
+        other._field = other._place_stars(self.stars[stars])
         return other
 
     def with_star(self, place: Array) -> Scene:

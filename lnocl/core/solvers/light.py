@@ -16,13 +16,15 @@ The noise of the sum over shares q of pixels is that of counts alone,
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lnocl.core.scene.arrays import Array
 from lnocl.core.scene.camera import images_of, is_flat
+from lnocl.core.scene.components import Mixing
 from lnocl.core.scene.detector import on_sky
 from lnocl.core.scene.estimate import Estimate
 from lnocl.core.scene.forward_model import Model
@@ -132,6 +134,51 @@ class Light:
         inside = (x >= 0) & (x < nx) & (y >= 0) & (y < ny)
         inside[inside] = shares[y[inside], x[inside]] > 0
         return np.append(inside, np.ones(scene.n_halos, bool))
+
+
+class LightOfComponents:
+    r"""The light of several skies, from that of what each filter shows.
+
+    With U the pseudo-inverse of the filters' weights w, and F_g the light of the sky that filter g
+    shows,
+
+    .. math:: F_k = \sum_g U_{kg} F_g, \qquad \operatorname{cov}(F_k, F_l) =
+        \sum_g U_{kg} U_{lg} \Big[ \operatorname{var} F_g
+        + \sum_m F_m^2 \operatorname{var} w_{gm} \Big].
+
+    Parameters
+    ----------
+    estimate : Estimate
+        What is modelled.
+    lights : sequence of Light
+        That of each of its parts.
+    """
+
+    def __init__(self, estimate: Estimate, lights: Sequence[Light]) -> None:
+        self._estimate, self._lights = estimate, lights
+        self._mixing = cast(Mixing, estimate.scene.mixing)
+
+    def sky(self) -> Array:
+        """Return the skies, electrons per pixel, shape (K, ny, nx)."""
+        pairs = zip(self._lights, self._estimate.parts, strict=True)
+        left = [light.sky() - part.estimate.observed_sky for light, part in pairs]
+        return self._estimate.observed_sky + self._mixing.components(left)
+
+    def flux(self, shares: Array, star_flux_errors: Array) -> tuple[Array, Array]:
+        """Return that of `Light.flux` of each sky, shapes (K,)."""
+        fluxes, covariance = self.covariance(shares, star_flux_errors)
+        return fluxes, np.sqrt(np.diag(covariance))
+
+    def covariance(self, shares: Array, star_flux_errors: Array) -> tuple[Array, Array]:
+        """Return the sums of `Light.flux` of each sky, (K,), and their covariances, (K, K)."""
+        pairs = zip(self._lights, self._estimate.parts, strict=True)
+        found = [light.flux(shares, star_flux_errors[part.fluxes]) for light, part in pairs]
+        sums, errors = np.array(found).T
+        undone = self._mixing.undone
+        fluxes = undone @ sums
+        first = [part.images[0] for part in self._estimate.parts]
+        of_weights = self._estimate.scene.observation.component_errors[first] ** 2 @ fluxes**2
+        return fluxes, undone * (errors**2 + of_weights) @ undone.T
 
 
 def _over(image: Array, ones: Array | float) -> Array:
