@@ -288,6 +288,8 @@ def _ending(prepared: Prepared, choice: Result) -> Prepared:
 
 def for_the_whole(observation: Observation) -> str | None:
     """Return why an observation is not for tiles, and what to do; None where it is."""
+    if observation.component_names:
+        return "tiles are of one sky; take deconvolve for the whole, or leave `components` out"
     if len(observation.halos):
         return (
             "a tile cannot tell the `halos` in it from a smooth sky, as whole images can; take "

@@ -123,11 +123,14 @@ class RerunOfFile:
     def _refuse_another(self, found: Outcome) -> None:
         expected = self.saved.extended * self.frames.electrons
         fluxes = self.saved.star_fluxes * self.frames.electrons
-        ny, nx = found.observation.sky_shape
+        observation = found.observation
+        ny, nx = observation.sky_shape
         if (
-            expected.shape != (ny, nx)
+            expected.shape != observation.skies_shape
             or found.fluxes_of_stars.size != fluxes.size
-            or not np.allclose(found.sky[:ny, :nx], expected, SAME, ROUNDING * abs(expected).max())
+            or not np.allclose(
+                found.sky[..., :ny, :nx], expected, SAME, ROUNDING * abs(expected).max()
+            )
             or not np.allclose(found.fluxes_of_stars, fluxes, SAME, equal_nan=True)
         ):
             raise InputError(

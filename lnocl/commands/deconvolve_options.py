@@ -93,6 +93,17 @@ OPTIONS = {
         parameter(Calibration, "align"),
         parameter(Calibration, "angle", metavar="ANGLE", checksum="ASUM"),
         parameter(Calibration, "epoch", metavar="EPOCH", needs=("stars", "star_table")),
+        parameter(
+            Calibration,
+            "components",
+            "--component",
+            action="append",
+            nargs=None,
+            dest="components",
+            type=options.mixture,
+            metavar="NAME=WEIGHTS",
+            card=("COMP", "component, and its weight in each image"),
+        ),
         parameter(Calibration, "centre", type=options.pixel, metavar="X,Y", needs=("angle",)),
     ],
     "stars": [

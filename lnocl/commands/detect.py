@@ -53,7 +53,7 @@ def _run(arguments: argparse.Namespace) -> list[str]:
 def find(arguments: argparse.Namespace, content: str) -> tuple[Significance, RerunOfFile]:
     """Return the significance of sources in a result, and what its run was made of."""
     from lnocl.io import atomic, tables
-    from lnocl.significance import check_search, significance
+    from lnocl.significance import check_search, refuse_components, significance
 
     check_search(arguments.width, arguments.false_alarms)
 
@@ -65,6 +65,7 @@ def find(arguments: argparse.Namespace, content: str) -> tuple[Significance, Rer
 
     check()  # before the result is read; then that nothing that it was made of is replaced
     again = RerunOfFile.read(arguments.result, arguments.quiet, check)
+    refuse_components(again.frames.observation)
     outcome = again.outcome()
     with ignored_notes():
         return significance(outcome, arguments.width, arguments.false_alarms), again

@@ -171,6 +171,22 @@ def placed_file(word: str) -> str:
     return word
 
 
+def mixture(word: str) -> str:
+    """Return a word ``NAME=WEIGHT,WEIGHT,...``.
+
+    Raises
+    ------
+    argparse.ArgumentTypeError
+        Another text.
+    """
+    name, weights = parse_kind(word)
+    if not (name.strip() and all(each.strip() for each in weights.split(","))):
+        raise argparse.ArgumentTypeError(
+            f"{word!r} is not NAME=WEIGHT,WEIGHT,..., such as line=1,0 for two images"
+        )
+    return word
+
+
 def _listed(value: Any) -> list[Any]:
     if value is None:
         return []

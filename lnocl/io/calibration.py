@@ -70,6 +70,14 @@ class Calibration(NamedTuple):
         Give the word each, where every image is an epoch; the word night, where the images of a
         night are one, by the dates in their headers; a keyword of these such as DATE-OBS; or a
         label for each image (default: one epoch).
+    components : sequence of str
+        Skies of which each image shows a known mixture: the name of one, and its weight in each
+        image, or one weight for all, as in line=1,0 and continuum=1,1 for an image in a line and
+        one beside it. A weight is a number; one with its standard error, as in 0.93+-0.02; or a
+        keyword of the images' headers, or 1 over it, as in continuum=1/PHOTFLAM. Weights by
+        keywords are divided by the largest of their component. May be repeated (default: one sky).
+
+        A standard error is that of the weight after this division.
     oversample, effective_psfs, psf_centre, psf_error
         As for `Observation`.
     psf_errors : sequence of str
@@ -102,6 +110,7 @@ class Calibration(NamedTuple):
     angle: Sequence[Word] = ()
     centre: tuple[float, float] | None = None
     epoch: Sequence[Word] = ()
+    components: Sequence[str] = ()
     oversample: int = 1
     effective_psfs: bool = False
     psf_centre: PsfCentre = "check"

@@ -20,6 +20,7 @@ from lnocl.io.fitsread import keyword_number, read_extension, read_stack
 from lnocl.io.image_files import ImageFiles
 from lnocl.io.levels import sky_level, sky_noise
 from lnocl.io.masks import read_mask
+from lnocl.io.mixtures import read_components
 from lnocl.io.names import PSF_ERRORS, parse_kind
 from lnocl.io.pixel_scales import warn_of_pixel_scales
 from lnocl.io.places import read_epochs, read_places
@@ -143,6 +144,7 @@ class _Reader:
             mask=mask if mask.any() else None,
             exposure=1.0 if exposure is None else exposure,
             **places.maps,
+            **read_components(self._files, self._calibration.components),
             epochs=read_epochs(self._images, self._paths, self._calibration.epoch),
             oversample=self._calibration.oversample,
             effective_psfs=self._calibration.effective_psfs,

@@ -61,8 +61,9 @@ PARTS = {
     "PLAN": Part(("step", "done")),
     "MESSAGES": Part(("message",)),
     "EPOCHS": Part(("label",)),
-    # The planes of the extended source, where it has several.
+    # The planes of the extended source, where it has several, and their noise by counts.
     "COMPONENTS": Part(("name", "flux", "flux_error")),
+    "NOISE": Part(pixels="f4", place=SKY, unit=LIGHT),
     # One row: the outcome of the run, from which errors and detections begin.
     "ESTIMATE": Part(("digest",)),
     # What was measured, and regions; the standard error and bias of each pixel, and the share of

@@ -23,7 +23,7 @@ Columns = dict[str, NDArray[np.float64]]
 
 TABLES = "STARS", "HALOS", "HISTORY", "CURVE", "HELDOUT"
 CUBES = ("MODELS", "RESIDUALS", "ELECTRONS")
-READ = *TABLES, *CUBES, "DOUBTFUL", "MESSAGES", "EPOCHS"
+READ = *TABLES, *CUBES, "DOUBTFUL", "MESSAGES", "EPOCHS", "COMPONENTS", "NOISE"
 # Words of a shell with bytes that FITS does not allow, as `fitswrite.history_lines` writes them.
 QUOTED = re.compile(r"\$'((?:[^'\\]|\\.)*)'")
 
@@ -38,8 +38,8 @@ class SavedResult:
         The file.
     header : astropy.io.fits.Header
         Header of the extended source.
-    extended : ndarray of float64, shape (ny, nx)
-        Extended source, in the unit of BUNIT per pixel.
+    extended : ndarray of float64, shape (ny, nx) or (K, ny, nx)
+        Extended source, in the unit of BUNIT per pixel; with components a sky each.
     tables : dict of str to dict of str to ndarray of float64
         Columns of the tables `TABLES` that are there; ``STARS`` always is.
     cubes : dict of str to ndarray of float64, shape (p, ny, nx)
@@ -49,12 +49,16 @@ class SavedResult:
         Of the images, pixels; 0 where the cubes have none.
     turns : ndarray of float64, shape (p, 2, 2), or None
         Rotations and flips of the images, where the cubes have them.
-    doubtful : ndarray of bool, shape (ny, nx), or None
+    doubtful : ndarray of bool, of the shape of `extended`, or None
         The image ``DOUBTFUL``, where it is there.
     messages : list of str
         The table ``MESSAGES``: messages of the run.
     epoch_labels : list of str
-        The table ``EPOCHS``: the labels of several epochs.
+        The table ``EPOCHS``: the labels of several epochs, or filters.
+    component_names : list of str
+        The names in the table ``COMPONENTS``; none where there is one sky.
+    noise : ndarray of float64, shape (K, ny, nx), or None
+        The image ``NOISE``, where it is there.
     """
 
     path: str
@@ -67,6 +71,8 @@ class SavedResult:
     doubtful: NDArray[np.bool_] | None
     messages: list[str]
     epoch_labels: list[str]
+    component_names: list[str]
+    noise: NDArray[np.float64] | None
 
     @property
     def stars(self) -> list[tuple[float, float]]:
@@ -127,17 +133,20 @@ class SavedResult:
         n_epochs = int(np.max(self.tables["STARS"].get("epoch", 0.0), initial=0.0)) + 1
         if n_labels != n_epochs and (n_labels or n_epochs > 1):
             return f"EPOCHS has {n_labels} labels of {n_epochs} epochs"
-        if self.extended.ndim != 2:
-            return "the image is a cube"
+        n_skies, shape = len(self.component_names), self.extended.shape
+        if shape[:-2] != (n_skies,) * bool(n_skies) or len(shape) < 2:
+            return f"the image has the shape {shape}, with {n_skies} names in COMPONENTS"
+        ny, nx = shape[-2:]
         oversample = self.number("OVERSAMP") or 1.0
-        if oversample not in OVERSAMPLES or any(n % oversample for n in self.extended.shape):
+        if oversample not in OVERSAMPLES or ny % oversample or nx % oversample:
             return f"OVERSAMP is {oversample:g}"
         for name, cube in self.cubes.items():
-            shape = len(self.cubes["MODELS"]), *(int(n // oversample) for n in self.extended.shape)
+            shape = len(self.cubes["MODELS"]), int(ny // oversample), int(nx // oversample)
             if cube.shape != shape and (name, cube.shape) != ("ELECTRONS", (*shape[:1], 1, 1)):
                 return f"{name} has the shape {cube.shape}"
-        if self.doubtful is not None and self.doubtful.shape != self.extended.shape:
-            return f"DOUBTFUL has the shape {self.doubtful.shape}"
+        for name, each in {"DOUBTFUL": self.doubtful, "NOISE": self.noise}.items():
+            if each is not None and each.shape != self.extended.shape:
+                return f"{name} has the shape {each.shape}"
         return ""
 
 
@@ -167,6 +176,7 @@ def read_result(path: str) -> SavedResult:
     cubes = {name: found[name] for name in CUBES} if {*CUBES} <= {*found} else {}
     doubtful = found["DOUBTFUL"] != 0 if "DOUBTFUL" in found else None
     labels = found["EPOCHS"]["label"].tolist() if "EPOCHS" in found else []
+    components = found["COMPONENTS"]["name"].tolist() if "COMPONENTS" in found else []
     cards = readable(parts["RESIDUALS"].header) if cubes else fits.Header()
     p = len(cubes["MODELS"]) if cubes else 0
     offsets = [
@@ -186,6 +196,8 @@ def read_result(path: str) -> SavedResult:
         doubtful,
         found["MESSAGES"]["message"].tolist() if "MESSAGES" in found else [],
         labels,
+        components,
+        found.get("NOISE"),
     )
     if fault := result._fault():
         raise no_result(path, fault)

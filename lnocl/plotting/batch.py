@@ -44,11 +44,12 @@ def draw_batch(results: Mapping[str, str]) -> Figure:
         each.set_axis_off()
     for each, (name, path) in zip(axes, results.items(), strict=False):
         saved = read_result(path)
-        ny, nx = saved.extended.shape
+        extended = np.hstack([*saved.extended]) if saved.component_names else saved.extended
+        ny, nx = extended.shape
         step = max(math.ceil(max(ny, nx) / SIDE), 1)
-        top = max(float(np.quantile(saved.extended, 1.0 - BRIGHTEST)), np.finfo(float).tiny)
+        top = max(float(np.quantile(extended, 1.0 - BRIGHTEST)), np.finfo(float).tiny)
         norm = AsinhNorm(linear_width=top / 30.0, vmin=0.0, vmax=top)
-        show_image(each, saved.extended[::step, ::step], norm, extent_of((ny, nx)))
+        show_image(each, extended[::step, ::step], norm, extent_of((ny, nx)))
         for x, y in saved.sky_stars:
             each.plot(x, y, "+", color="white", markersize=4)
         each.set_title(as_text(name), fontsize=6, pad=2)

@@ -81,13 +81,16 @@ def make_report(
         "regions": [_region(view, region, 1 if region.middle else step) for region in regions],
         "stars": [[round(x, 3), round(y, 3)] for x, y in view.stars],
         "first": result.worst_image(view, regions[0]) if len(view.images) else 0,
-        "palettes": {"source": _palette(COLOUR_MAP), "residuals": _palette("RdBu_r")},
+        "palettes": {name: _palette(name) for name in (COLOUR_MAP, result.NOISE, result.RATIO)},
         "arcseconds": None if arcseconds is None else arcseconds.tolist(),
     }
     notes = {
         f"The whole frame is shown in blocks of {step} x {step} pixels.": step > 1,
         "The extended source is finer: shown is its light in each pixel of the images.": (
             view.oversample > 1
+        ),
+        f"Ratios are blank where a component is within {result.ABOVE_NOISE:g} times its noise.": (
+            bool(view.ratios())
         ),
         "The file has no models and residuals: repeat the run with both.": not len(view.images),
     }
@@ -110,13 +113,15 @@ def make_report(
 
 def frame_step(view: ResultView) -> int:
     """Return the side of the blocks in which the whole frame fits the page, pixels."""
-    each = BYTES_OF_IMAGE * len(view.images) + BYTES_OF_SOURCE
+    n_skies = min(len(view.names) + len(view.ratios()) or 1, result.MOST_SKIES)
+    each = BYTES_OF_IMAGE * len(view.images) + BYTES_OF_SOURCE * n_skies
     return max(1, int(np.ceil(np.sqrt(math.prod(view.shape) * each / FRAME_BYTES))))
 
 
 def _region(view: ResultView, region: Region, step: int) -> dict[str, Any]:
     """Return the pictures of a region: image, model and residuals of each image, and the source."""
     images: list[list[dict[str, Any]]] = []
+    in_unit = view.unit, f"{view.unit} per pixel", COLOUR_MAP
     for j in range(len(view.images)):
         offset = view.offset_at(j, region)
         shape = view.images[j].shape
@@ -126,8 +131,9 @@ def _region(view: ResultView, region: Region, step: int) -> dict[str, Any]:
             images.append([])
             continue
         scale = result.image_limits(view.images[j])[2]
-        light = (*result.image_limits(view.images[j][there])[:2], scale), corner, view.unit
-        noise = (-result.MAX_SIGMA, result.MAX_SIGMA, 0.0), corner, "sigma"
+        light = (*result.image_limits(view.images[j][there])[:2], scale), corner, *in_unit
+        limits = -result.MAX_SIGMA, result.MAX_SIGMA, 0.0
+        noise = limits, corner, "sigma", "residual / noise", result.NOISE
         layers = (
             ("image", view.images[j], light),
             ("model", view.models[j], light),
@@ -138,18 +144,26 @@ def _region(view: ResultView, region: Region, step: int) -> dict[str, Any]:
         )
     there, q = region.slices(view.shape), view.oversample
     # Of a finer sky the light in each pixel of the images.
-    extended = q**2 * block_means(view.extended[finer_slices(there, q)], q)
-    top, corner = result.brightest(extended), _corner(there, view.shape, (0.0, 0.0))
+    fine, corner, sources = finer_slices(there, q), _corner(there, view.shape, (0.0, 0.0)), []
+    skies = view.skies()
+    extended = {name: q**2 * block_means(sky.extended[fine], q) for name, sky in skies.items()}
+    top = max(map(result.brightest, extended.values()))
     limits = 0.0, top, result.FAINT_SHARE * top
-    source = _layer("extended source", block_means(extended, step), limits, corner, view.unit)
-    if view.doubtful is not None:
-        flags = block_means(view.doubtful[finer_slices(there, q)], q * step) >= 0.5
-        source["doubtful"] = {"png": _png(flags[::-1].astype(np.uint8))}
+    for name, light in extended.items():
+        source = _layer(name, block_means(light, step), limits, corner, *in_unit)
+        if (doubtful := skies[name].doubtful) is not None:
+            flags = block_means(doubtful[fine], q * step) >= 0.5
+            source["doubtful"] = {"png": _png(flags[::-1].astype(np.uint8))}
+        sources.append(source)
+    for name, ratio in view.ratios().items():
+        limits = 0.0, result.highest(ratio[fine]), 0.0
+        how = limits, corner, "", name, result.RATIO
+        sources.append(_layer(name, block_means(ratio[fine], q * step), *how))
     turned = None
     if view.turns is not None:  # the map to each image, less the corner's shift
         shifts = [view.offset_at(j, region) for j in range(len(images))]
         turned = np.dstack([view.turns, view.offsets - shifts]).tolist()
-    found = {"images": images, "source": source, "turned": turned}
+    found = {"images": images, "sources": sources[: result.MOST_SKIES], "turned": turned}
     return {"name": region.name, "step": step, **found}
 
 
@@ -160,7 +174,13 @@ def _corner(there: Any, shape: Sequence[int], offset: Sequence[float]) -> tuple[
 
 
 def _layer(
-    name: str, values: Array, limits: Sequence[float], corner: Sequence[float], unit: str
+    name: str,
+    values: Array,
+    limits: Sequence[float],
+    corner: Sequence[float],
+    unit: str,
+    label: str,
+    palette: str,
 ) -> dict[str, Any]:
     """Return a picture and how its pixels are read; a scale of 0 is linear, else they are asinh."""
     low, high, scale = limits
@@ -170,7 +190,8 @@ def _layer(
         shares = np.arcsinh(shares * steepness) / np.arcsinh(steepness)
     codes = np.where(np.isfinite(shares), 1 + np.round(STEPS * np.nan_to_num(shares)), 0)
     read = dict(zip(("low", "high", "scale", "x", "y"), (*limits, *corner), strict=True))
-    return {"name": name, "unit": unit, **read, "png": _png(codes[::-1].astype(np.uint8))}
+    words = {"name": name, "unit": unit, "label": label, "palette": palette}
+    return {**words, **read, "png": _png(codes[::-1].astype(np.uint8))}
 
 
 def _png(codes: NDArray[np.uint8]) -> str:

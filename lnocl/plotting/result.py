@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from lnocl.core.scene.arrays import Array
+from lnocl.core.scene.components import CONTINUUM
 from lnocl.plotting import light_curves
 from lnocl.plotting.figure import (
     COLOUR_MAP,
@@ -31,6 +33,16 @@ MAX_SIGMA = 5.0
 FAINT_SHARE = 3e-3
 # So many stars are targets: the first, as those named one by one come before those of a table.
 TARGETS = 3
+# A ratio of components is shown where both are so many times their noise, and skies and ratios are
+# shown up to a number.
+ABOVE_NOISE, MOST_SKIES = 3.0, 9
+# The share of the pixels of a ratio that are not brighter than the colours show.
+BRIGHTEST = 0.98
+BLANK = "grey: within noise"
+# The one sky that there is without components.
+EXTENDED = "extended source"
+# The colours of residuals, and of ratios.
+NOISE, RATIO = "RdBu_r", "cividis"
 # What red lines are.
 OUTLINED = "red: perhaps the PSF's error alone"
 
@@ -70,6 +82,10 @@ class ResultView:
         Rotations, flips and scales of the images; None where there are none.
     light_curves : LightCurves or None
         Of the stars, where there are several epochs.
+    names : sequence of str
+        Of the components, where the extended source, and `doubtful`, have a plane for each.
+    noise : ndarray of float64, shape (K, ny, nx), or None
+        The noise of each component.
     """
 
     extended: Array
@@ -87,6 +103,8 @@ class ResultView:
     oversample: int = 1
     turns: Array | None = None
     light_curves: LightCurves | None = None
+    names: Sequence[str] = ()
+    noise: Array | None = None
 
     def place(self, j: int, position: Sequence[float]) -> tuple[float, float]:
         """Return where a position of the sky is in image j."""
@@ -103,8 +121,28 @@ class ResultView:
     @property
     def shape(self) -> tuple[int, int]:
         """Shape (ny, nx) of the sky in pixels of the images."""
-        ny, nx = self.extended.shape
+        ny, nx = self.extended.shape[-2:]
         return ny // self.oversample, nx // self.oversample
+
+    def skies(self) -> dict[str, ResultView]:
+        """Return the components as extended sources by their names, or the one that there is."""
+        if not self.names:
+            return {EXTENDED: self}
+        doubtful = [None] * len(self.names) if self.doubtful is None else self.doubtful
+        planes = zip(self.names, self.extended, doubtful, strict=True)
+        return {
+            name: replace(self, extended=sky, doubtful=flags, names=())
+            for name, sky, flags in planes
+        }
+
+    def ratios(self) -> dict[str, Array]:
+        """Return the other components over the continuum, NaN where one is not above noise."""
+        if CONTINUUM not in self.names or self.noise is None:
+            return {}
+        bright = np.where(self.extended > ABOVE_NOISE * self.noise, self.extended, np.nan)
+        shown = dict(zip(self.names, bright, strict=True))
+        below = shown.pop(CONTINUUM)
+        return {f"{name} / {CONTINUUM}": each / below for name, each in shown.items()}
 
     def zooms(self) -> list[int]:
         """Return the stars to enlarge, in their order: the first, and the brightest of others."""
@@ -158,10 +196,11 @@ def draw_result(view: ResultView) -> Figure:
     -------
     matplotlib.figure.Figure
         A row for the whole frame and one for each of six stars, the first three and the brightest
-        of the others: image, model, residuals and extended source. With several images, each row
-        shows that whose residuals are largest there. Below them the errors that held-out counts
-        estimate, or else the objective; and light curves of the stars where there are several
-        epochs.
+        of the others: image, model, residuals and extended source. With components there are rows
+        for them below, on one stretch, and for their ratios to that called continuum. With several
+        images, each row shows that whose residuals are largest there. Below them the errors that
+        held-out counts estimate, or else the objective; and light curves of the stars where there
+        are several epochs.
 
     Raises
     ------
@@ -172,29 +211,34 @@ def draw_result(view: ResultView) -> Figure:
     regions = [Region("whole frame")]
     regions += [Region(f"star {s + 1}", view.stars[s], view.half()) for s in stars]
     has_images = len(view.images) > 0
-    shape = (len(regions), 4) if has_images else (-(-len(regions) // 4), min(len(regions), 4))
-    height = 2.7 * shape[0]
+    n_columns, groups = 3 if view.names else 4, [_panels(view, region) for region in regions]
+    if not (has_images or view.names):
+        groups = [[panel for group in groups for panel in group]]
+    rows = [group[i : i + n_columns] for group in groups for i in range(0, len(group), n_columns)]
+    height = 2.7 * len(rows)
     below: list[Any] = [(draw_choice, view), (light_curves.draw, view.light_curves)]
     below = below[: 1 + (view.light_curves is not None)]
     heights = height, *(2.3 for _ in below)
-    figure = new_figure(max(3.0 * shape[1], 6.0), sum(heights) + 0.6)
+    n_columns = max(map(len, rows))
+    figure = new_figure(max(3.0 * n_columns, 6.0), sum(heights) + 0.6)
     parts: Any = figure.subfigures(len(heights), 1, height_ratios=heights)
-    axes = parts[0].subplots(*shape, squeeze=False)
-    if has_images:
-        for row, region in zip(axes, regions, strict=True):
-            _draw_images(row[:3], view, region)
-            draw_extended(row[3], view, region, "extended source")
-    else:
-        for axis, region in zip(axes.flat, regions, strict=False):
-            draw_extended(axis, view, region, f"extended source, {region.name}")
-        for axis in axes.flat[len(regions) :]:
+    axes = parts[0].subplots(len(rows), n_columns, squeeze=False)
+    for row, panels in zip(axes, rows, strict=True):
+        for axis, panel in zip(row, panels, strict=False):
+            panel(axis)
+        for axis in row[len(panels) :]:
             axis.set_axis_off()
     for axis in axes[-1]:
         axis.set_xlabel("x (pixels)", fontsize=9)
     for axis in axes[:, 0]:
         axis.set_ylabel("y (pixels)", fontsize=9)
+    said = list[str]()
     if len(view.stars) > len(stars):
-        parts[0].suptitle(f"enlarged: {len(stars)} of {len(view.stars)} stars")
+        said.append(f"enlarged: {len(stars)} of {len(view.stars)} stars")
+    if (n_skies := len(view.names) + len(view.ratios())) > MOST_SKIES:
+        said.append(f"the first {MOST_SKIES} of {n_skies} components and ratios")
+    if said:
+        parts[0].suptitle("; ".join(said))
     for part, (draw, what) in zip(parts[1:], below, strict=True):
         draw(part.subplots(), what)
     return figure
@@ -233,23 +277,67 @@ def brightest(extended: Array) -> float:
     return top if top > np.sqrt(np.finfo(float).tiny) else 1.0
 
 
-def _draw_images(axes: Sequence[Axes], view: ResultView, region: Region) -> None:
-    """Draw image, model and residuals of a region."""
+def _panels(view: ResultView, region: Region) -> list[Callable[[Axes], None]]:
+    """Return what draws image, model and residuals of a region, then its skies and their ratios."""
     from matplotlib.colors import AsinhNorm, Normalize
 
-    j = worst_image(view, region)
-    there = region.slices(view.images[j].shape, view.offset_at(j, region))
-    low, high, _ = image_limits(view.images[j][there])
-    name = "image" if len(view.images) == 1 else f"image {j + 1} of {len(view.images)}"
-    norm = AsinhNorm(image_limits(view.images[j])[2], low, high)
-    light = norm, COLOUR_MAP, f"{as_text(view.unit)} per pixel"
-    noise = Normalize(-MAX_SIGMA, MAX_SIGMA), "RdBu_r", "sigma"
-    cubes = (view.images, light), (view.models, light), (view.residuals, noise)
-    titles = f"{name}, {region.name}", "model", "residuals / noise"
-    for axis, (cube, (each, colours, label)), title in zip(axes, cubes, titles, strict=True):
-        _add_bar(axis, _draw_region(axis, cube[j], there, each, colours), label)
-        axis.set_title(title, fontsize=10)
-    _mark_stars(axes[0], [view.place(j, star) for star in view.stars])
+    panels = list[Callable[[Axes], None]]()
+    if len(view.images):
+        j = worst_image(view, region)
+        there = region.slices(view.images[j].shape, view.offset_at(j, region))
+        low, high, _ = image_limits(view.images[j][there])
+        name = "image" if len(view.images) == 1 else f"image {j + 1} of {len(view.images)}"
+        norm = AsinhNorm(image_limits(view.images[j])[2], low, high)
+        light = norm, COLOUR_MAP, f"{as_text(view.unit)} per pixel"
+        noise = Normalize(-MAX_SIGMA, MAX_SIGMA), NOISE, "sigma"
+        cubes = (view.images, light), (view.models, light), (view.residuals, noise)
+        titles = f"{name}, {region.name}", "model", "residuals / noise"
+        stars = [[view.place(j, star) for star in view.stars], (), ()]
+        for (cube, how), title, marked in zip(cubes, titles, stars, strict=True):
+            panels.append(partial(_draw_panel, cube[j], there, title, how, marked, 1))
+    where = "" if panels and not view.names else f", {region.name}"
+    skies = view.skies()
+    top = shared_top(skies.values(), region)
+    for name, sky in skies.items():
+        panels.append(
+            partial(draw_extended, view=sky, region=region, title=as_text(name) + where, top=top)
+        )
+    there = finer_slices(region.slices(view.shape), view.oversample)
+    for name, ratio in view.ratios().items():
+        how = Normalize(0.0, highest(ratio[there])), RATIO, as_text(name)
+        title = f"{as_text(name)}{where}\n{BLANK}"
+        panels.append(partial(_draw_panel, ratio, there, title, how, view.stars, view.oversample))
+    return panels[: MOST_SKIES + 3 * (len(view.images) > 0)]
+
+
+def _draw_panel(
+    image: NDArray[Any],
+    there: Any,
+    title: str,
+    how: tuple[Any, str, str],
+    stars: Sequence[tuple[float, float]],
+    oversample: int,
+    axis: Axes,
+) -> None:
+    """Draw a part of an image with a title, a norm, colours and the label of their bar."""
+    norm, colours, label = how
+    _add_bar(axis, _draw_region(axis, image, there, norm, colours, oversample), label)
+    axis.set_title(title, fontsize=10)
+    _mark_stars(axis, stars)
+
+
+def highest(ratio: Array) -> float:
+    """Return the value of a ratio that the brightest colour stands for."""
+    known = ratio[np.isfinite(ratio)]
+    return float(np.quantile(known, BRIGHTEST)) if known.any() else 1.0
+
+
+def shared_top(skies: Iterable[ResultView], region: Region) -> float:
+    """Return the brightest pixel that any of several skies has in a region."""
+    return max(
+        brightest(sky.extended[finer_slices(region.slices(sky.shape), sky.oversample)])
+        for sky in skies
+    )
 
 
 def draw_extended(
@@ -261,13 +349,12 @@ def draw_extended(
     there = finer_slices(region.slices(view.shape), view.oversample)
     top = brightest(view.extended[there]) if top is None else top
     norm = AsinhNorm(FAINT_SHARE * top, 0.0, top)
-    shown = _draw_region(axis, view.extended, there, norm, COLOUR_MAP, view.oversample)
-    if view.doubtful is not None and view.doubtful[there].any():
+    how = norm, COLOUR_MAP, f"{as_text(view.unit)} per pixel"
+    is_doubtful = view.doubtful is not None and view.doubtful[there].any()
+    title += f"\n{OUTLINED}" * bool(is_doubtful)
+    _draw_panel(view.extended, there, title, how, view.stars, view.oversample, axis)
+    if view.doubtful is not None and is_doubtful:
         outline(axis, view.doubtful, there, view.oversample)
-        title += f"\n{OUTLINED}"
-    axis.set_title(title, fontsize=10)
-    _add_bar(axis, shown, f"{as_text(view.unit)} per pixel")
-    _mark_stars(axis, view.stars)
 
 
 def outline(

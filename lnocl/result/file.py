@@ -19,7 +19,7 @@ from lnocl.io.fitswrite import Card, column_unit, write_result
 from lnocl.io.parts import PARTS, Column
 from lnocl.result import Result
 from lnocl.result.kept import to_parts
-from lnocl.result.views import electrons_in
+from lnocl.result.views import electrons_in, noise_of
 
 # The table ESTIMATE has this many bytes at most.
 MOST_BYTES = 2**26
@@ -98,6 +98,7 @@ def write_file(
             Column("flux", fluxes, light),
             Column("flux_error", errors, light, "standard error"),
         ]
+        parts["NOISE"] = noise_of(result, electrons)
     if has_cubes:
         models = result.models()
         parts |= {"MODELS": models, "RESIDUALS": result._residuals(models)}
@@ -180,11 +181,12 @@ def _star_columns(
     flux_errors = result.star_flux_errors / electrons
     columns.append(Column("flux_error", flux_errors, column_unit(unit), "standard error"))
     if (n_epochs := result._observation.n_epochs) > 1:
-        epochs = np.arange(len(positions)) % float(n_epochs)
-        columns.append(Column("epoch", epochs, "", "number of the epoch, from 0 on"))
-        changes = result.star_variation_errors / electrons
-        comment = "standard error against the star's mean"
-        columns.append(Column("variation_error", changes, column_unit(unit), comment))
+        epochs, what = np.arange(len(positions)) % float(n_epochs), "row of EPOCHS, from 0 on"
+        columns.append(Column("epoch", epochs, "", what))
+        if not result.component_names:
+            changes = result.star_variation_errors / electrons
+            comment = "standard error against the star's mean"
+            columns.append(Column("variation_error", changes, column_unit(unit), comment))
     if header is not None and sky.has_celestial(header):
         ra, dec = sky.to_sky(positions, header).T
         columns += [

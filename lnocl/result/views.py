@@ -8,6 +8,8 @@ import numpy as np
 
 from lnocl.core.runs.outcome import mean_over_epochs
 from lnocl.core.scene.arrays import Array
+from lnocl.core.scene.detector import psfs_on_detector
+from lnocl.core.scene.forward_model import Model
 from lnocl.plotting.light_curves import light_curves
 from lnocl.plotting.result import ResultView
 from lnocl.result.summary import Unit
@@ -39,6 +41,32 @@ def electrons_in(result: Result, electrons: float) -> Array:
     return np.where(found > 0, found, np.nan)
 
 
+def noise_of(result: Result, electrons: float) -> Array:
+    r"""Return the noise of each component by the counts that it is seen in, shape (K, ny, nx).
+
+    It is that of the light of a pixel, in a unit of so many electrons, as the mean over the area
+    of the PSFs. With U the pseudo-inverse of the weights of filters g, its square is
+
+    .. math:: \sum_g U_{kg}^2 \Big/ \sum_{j \in g} A_j^T \frac{e_j}{m_j \sum K_j^2}.
+    """
+    estimate, observation = result._outcome.estimate, result._observation
+    ny, nx = observation.sky_shape
+    areas = 1.0 / (psfs_on_detector(observation) ** 2).sum(axis=(1, 2))
+    variances = []
+    for part in estimate.parts:
+        scene, models = part.estimate.scene, part.estimate.models()
+        model = Model(scene)
+        pairs = zip(areas[list(part.images)], model.weights, models, strict=True)
+        told = model.adjoint(
+            np.divide(area * weights, each, out=np.zeros(each.shape), where=each > 0)
+            for area, weights, each in pairs
+        )[:ny, :nx]
+        told *= scene.scale / scene.unit**2
+        variances.append(np.divide(1.0, told, out=np.full((ny, nx), np.nan), where=told > 0))
+    noise = np.sqrt(np.einsum("kg,gyx->kyx", observation.mixing.undone**2, variances))
+    return np.asarray(noise / (electrons * observation.oversample**2))
+
+
 def view_of(result: Result, unit: Unit | None = None) -> ResultView:
     """Return the arrays and texts of the picture of a result, in a unit."""
     unit = unit or Unit(result._unit)
@@ -64,7 +92,9 @@ def view_of(result: Result, unit: Unit | None = None) -> ResultView:
         light_curves=light_curves(
             result.star_fluxes / unit.electrons,
             result.star_variation_errors / unit.electrons,
-            observation.epoch_labels,
+            () if result.component_names else observation.epoch_labels,
             unit.name,
         ),
+        names=result.component_names,
+        noise=noise_of(result, unit.electrons) if result.component_names else None,
     )

@@ -79,8 +79,12 @@ def draw(folder: str, results: Sequence[str], overwrite: bool = False) -> Iterat
     for name, profile in profiles.items():
         yield save(folder, name, draw_bands(*profile), overwrite)
     if len(saved) > 1:
-        beside = draw_beside(dict(zip(_names(results), views, strict=True)))
-        yield save(folder, "objects", beside, overwrite)
+        beside = {
+            f"{name}, {sky}" if view.names else name: each
+            for name, view in zip(_names(results), views, strict=True)
+            for sky, each in view.skies().items()
+        }
+        yield save(folder, "objects", draw_beside(beside), overwrite)
 
 
 def read_profiles(path: str) -> list[tuple[str, Table, Table, str]]:
@@ -103,7 +107,7 @@ def read_profiles(path: str) -> list[tuple[str, Table, Table, str]]:
 def view_of(saved: SavedResult) -> ResultView:
     """Return the arrays and texts of the picture of a saved result."""
     q = saved.oversample
-    nothing = np.zeros((0, *(n // q for n in saved.extended.shape)))
+    nothing = np.zeros((0, *(n // q for n in saved.extended.shape[-2:])))
     models, residuals = (
         np.where(abs(cube) < LARGEST, cube, np.nan)
         for cube in (saved.cubes.get(name, nothing) for name in ("MODELS", "RESIDUALS"))
@@ -131,9 +135,11 @@ def view_of(saved: SavedResult) -> ResultView:
         light_curves=light_curves(
             saved.star_fluxes,
             table.get("variation_error", np.full(len(epochs), np.nan)),
-            saved.epoch_labels,
+            () if saved.component_names else saved.epoch_labels,
             unit,
         ),
+        names=saved.component_names,
+        noise=saved.noise,
     )
 
 
@@ -153,12 +159,12 @@ def check_saved(saved: Sequence[SavedResult]) -> None:
         Their shapes differ, one holds values that are not finite, or has a star outside its image.
     """
     first = saved[0]
-    ny, nx = first.extended.shape
+    ny, nx = first.extended.shape[-2:]
     for each in saved:
-        if each.extended.shape != (ny, nx):
+        if each.extended.shape[-2:] != (ny, nx):
             raise InputError(
-                f"{each.path} has the shape {each.extended.shape} and {first.path} {(ny, nx)}; "
-                "they must be the same"
+                f"{each.path} has the shape {each.extended.shape[-2:]} and {first.path} "
+                f"{(ny, nx)}; they must be the same"
             )
         if not (abs(each.extended) < LARGEST).all():
             raise InputError(f"{each.path} holds values that are not finite; draw another")

@@ -77,7 +77,7 @@ def arcseconds(saved: SavedResult) -> Array | None:
     """
     if not sky.has_celestial(saved.header):
         return None
-    middle = (np.array(saved.extended.shape[::-1]) - 1.0) / 2.0
+    middle = (np.array(saved.extended.shape[:-3:-1]) - 1.0) / 2.0
     at = np.array([*saved.sky_stars, middle][0])
     here, *ends = sky.to_sky(at + saved.oversample * np.eye(3, 2, -1), saved.header)
     moved = (np.array(ends) - here + 180.0) % 360.0 - 180.0

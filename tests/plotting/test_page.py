@@ -63,20 +63,20 @@ def test_its_pictures_are_the_arrays():
             # Half a step of asinh, which has 254, is wider where it is steeper.
             tolerance = 0.03 * abs(cube[j].clip(low, high) - low) + 0.01 * (high - low)
             assert np.nanmax(abs(shown - cube[j].clip(low, high)) / tolerance) < 1
-    source = decoded(whole["source"])
+    source = decoded(whole["sources"][0])
     assert abs(source - view.extended).max() < 0.02
     assert data["stars"] == [[10.0, 20.0]]
     # The region of the star begins where its pixels do.
     zoom = data["regions"][1]
-    assert (zoom["name"], zoom["source"]["x"], zoom["source"]["y"]) == ("star 1", 0, 0)
-    assert decoded(zoom["source"]).shape == (45, 35)
+    assert (zoom["name"], zoom["sources"][0]["x"], zoom["sources"][0]["y"]) == ("star 1", 0, 0)
+    assert decoded(zoom["sources"][0]).shape == (45, 35)
 
 
 def test_the_offset_of_an_image_moves_its_corner():
     view = make_view(p=2, stars=[(40.0, 30.0)], offsets=np.array([[0.0, 0.0], [5.0, -3.0]]))
     zoom = data_of(make_report(view, "a"))["regions"][1]
     assert (zoom["images"][1][0]["x"], zoom["images"][1][0]["y"]) == (16.0, 6.0)
-    assert (zoom["source"]["x"], zoom["source"]["y"]) == (16, 6)
+    assert (zoom["sources"][0]["x"], zoom["sources"][0]["y"]) == (16, 6)
 
 
 @pytest.mark.parametrize("oversample", [1, 2])
@@ -85,10 +85,10 @@ def test_doubtful_pixels_are_outlined_on_the_page(oversample):
     doubtful[20 * oversample : 30 * oversample, 5 * oversample : 9 * oversample] = True
     view = make_view(p=0, doubtful=doubtful, extended=1.0 * doubtful, oversample=oversample)
     for region in data_of(make_report(view, "a"))["regions"]:
-        light = decoded(region["source"])
-        np.testing.assert_array_equal(codes_of(region["source"]["doubtful"]) == 1, light > 0)
+        light = decoded(region["sources"][0])
+        np.testing.assert_array_equal(codes_of(region["sources"][0]["doubtful"]) == 1, light > 0)
         assert light.any()
-    assert "doubtful" not in data_of(make_report(make_view(p=0), "a"))["regions"][0]["source"]
+    assert "doubtful" not in data_of(make_report(make_view(p=0), "a"))["regions"][0]["sources"][0]
 
 
 def test_stars_of_a_turned_image_are_where_it_sees_them():
@@ -126,7 +126,7 @@ def test_it_is_small_whatever_the_images(p, side):
 def test_a_long_frame_is_shown():
     page = make_report(make_view(p=20, n_stars=0, shape=(2, 60000)), "a")
     assert len(page) < 3e6
-    assert decoded(data_of(page)["regions"][0]["source"]).shape[0] == 1
+    assert decoded(data_of(page)["regions"][0]["sources"][0]).shape[0] == 1
 
 
 def test_residuals_of_blocks_are_over_the_noise_of_blocks():
@@ -192,7 +192,7 @@ class TestCommand:
         assert "/home/me" not in page
         assert "datadata" not in page
         whole, _ = data_of(page)["regions"]
-        layers = [*whole["images"][0], whole["source"]]
+        layers = [*whole["images"][0], whole["sources"][0]]
         assert [layer["unit"] for layer in layers] == ["adu", "adu", "sigma", "adu"]
         # 2 electrons are an adu; an image is its model and a residual of one standard deviation.
         image, model, *_ = map(decoded, layers)

@@ -11,6 +11,7 @@ from lnocl.core.runs.outcome import Outcome
 from lnocl.core.runs.replicas import Sky
 from lnocl.core.scene.apertures import AMOUNT, FLUX, LENGTH, RATIO, Aperture, Label, Profile
 from lnocl.core.scene.arrays import Array
+from lnocl.core.scene.components import CONTINUUM
 from lnocl.core.scene.detector import on_sky
 from lnocl.core.scene.forward_model import Model
 from lnocl.core.scene.scene import Scene
@@ -20,9 +21,6 @@ from lnocl.core.scene.texture import CORE
 BELOW, UNDER, UNSEEN = "below the resolution", "under a star", "not observed"
 
 Part = Aperture | Profile
-
-# The component that the light of others is compared with.
-CONTINUUM = "continuum"
 
 
 class Quantity(NamedTuple):

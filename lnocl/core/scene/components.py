@@ -18,12 +18,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lnocl.core.scene.arrays import Array, numbers, refuse_unless
-from lnocl.errors import InputError
+from lnocl.errors import InputError, counted
 
 if TYPE_CHECKING:
     from lnocl.core.scene.fields import Field
     from lnocl.core.scene.observation import Observation
 
+# The component that the light of others is compared with.
+CONTINUUM = "continuum"
 # The most components, such as slices of a cube.
 MOST = 64
 # The least singular value of the weights, over the largest, that tells components apart.
@@ -158,7 +160,9 @@ def _by_name(parameter: str, value: Mapping[Any, Any], n_images: int) -> Array:
 def _refuse_unclear(weights: Array, names: Sequence[str]) -> None:
     """Refuse weights by which images do not tell the components apart."""
     if not 2 <= len(names) <= MOST:
-        raise InputError(f"`components` are {len(names)}; give 2 to {MOST}, or leave them out")
+        raise InputError(
+            f"`components` has {counted(len(names), 'name')}; give 2 to {MOST}, or leave it out"
+        )
     if dark := [name for name, each in zip(names, weights.T, strict=True) if not each.any()]:
         raise InputError(f"no image shows the component {dark[0]!r}: its weights are all 0")
     if blind := np.flatnonzero(~weights.any(axis=1)).tolist():
