@@ -185,7 +185,7 @@ def _judge_psfs(plan: Plan, setup: Setup, progress: bool) -> Mended:
 def _penalties(plan: Plan, mended: Mended, are_psfs_wrong: bool) -> list[Penalty]:
     """Return the penalty, or those from which held-out counts choose."""
     if not isinstance(plan.smoothing, str):
-        return [Penalty(plan.mu, plan.smoothing)]
+        return [Penalty(plan.mu, plan.smoothing, spectral=plan.spectral_smoothing)]
     observation = mended.setup.observation
     recommended, shares = recommend_smoothing(observation), shares_of_skies(observation)
     multiples: Sequence[float] = (1.0,)
@@ -195,8 +195,8 @@ def _penalties(plan: Plan, mended: Mended, are_psfs_wrong: bool) -> list[Penalty
     elif plan.stop == "held-out":
         multiples, reason = (0.0, *MULTIPLES), ""
     weights = (each * recommended for each in multiples)
-    near = mended.near_stars
-    penalties = [Penalty(plan.mu, each, near_stars=near, shares=shares) for each in weights]
+    first = Penalty(plan.mu, 0.0, None, mended.near_stars, shares, plan.spectral_smoothing)
+    penalties = [replace(first, smoothing=each) for each in weights]
     if reason:
         detail(f"`smoothing` chosen: {penalties[0].in_words()}, by {reason}")
     return penalties
