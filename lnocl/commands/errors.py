@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from lnocl.io.frames import Frames
 
 # Names of quantities of stars and halos; others are of regions and profiles.
-_OF_STARS = re.compile(r"star \d+( epoch \d+)? (flux|x|y)|halo \d+ image \d+")
+_OF_STARS = re.compile(r"star \d+( epoch \d+)? (flux( in .*)?|x|y)|halo \d+ image \d+")
 OPTIONS = [
     options.result("errors are added to it; replicas that it has already count"),
     parameter(Result.bootstrap, "n", "--bootstrap"),

@@ -161,13 +161,16 @@ def test_replicas_measure_each_component_and_how_bright_it_is_over_the_continuum
     found = result().bootstrap(10, regions=regions)
     names = [each.name for each in found.quantities]
     assert names == [
-        "star 1 epoch 0 flux",
-        "star 1 epoch 1 flux",
+        "star 1 flux in line + continuum",
+        "star 1 flux in continuum",
         "line region 1",
         "continuum region 1",
         "line / continuum region 1",
     ]
     values, errors = found.values, found.standard_errors
+    covariances = found.covariances
+    np.testing.assert_allclose(np.diag(covariances)[:2], errors[:2] ** 2, rtol=1e-9)
+    assert covariances[2, 3] < 0  # what the line has the continuum lacks
     assert values[4] == pytest.approx(values[2] / values[3])
     assert (errors > 0).all()
     assert found.error_map.shape == (2, *SHAPE)

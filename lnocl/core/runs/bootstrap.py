@@ -146,6 +146,15 @@ class Bootstrap:
         return np.asarray(np.maximum(found, self._least))
 
     @property
+    def covariances(self) -> Array:
+        """The covariances of the errors, shape (k, k), such as of components in one region.
+
+        Those of stars are in the light of regions. What smoothing changes is not in them.
+        """
+        hidden = np.maximum(self.stated**2 - self.errors.var(axis=0, ddof=1)[: len(self.stated)], 0)
+        return np.asarray(np.cov(self.errors.T) + (self.shares * hidden) @ self.shares.T)
+
+    @property
     def _least(self) -> Array:
         """The least errors of the light of regions, before and after the bias is taken from it."""
         changed = np.broadcast_to(self.of_smoothing, self.bias.shape)

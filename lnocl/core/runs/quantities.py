@@ -94,12 +94,16 @@ def quantities_of(
 
     The shares have a row for each quantity, and a column for each flux and position of those.
     """
-    scene = outcome.scene
-    n_epochs, images = scene.observation.n_epochs, range(scene.n_images)
-    epochs = [f" epoch {e}" for e in range(n_epochs)] if n_epochs > 1 else [""]
+    scene, observation = outcome.scene, outcome.scene.observation
+    n_epochs, images = observation.n_epochs, range(scene.n_images)
+    if observation.component_names:
+        where = [("", f" in {label}") for label in observation.epoch_labels]
+    else:
+        where = [(f" epoch {e}", "") for e in range(n_epochs)] if n_epochs > 1 else [("", "")]
     shown = np.flatnonzero(scene.is_shown[: scene.n_stars]).tolist()
-    labels = [Label(f"star {s // n_epochs + 1}{epochs[s % n_epochs]} flux", FLUX) for s in shown]
-    halos = range(len(scene.observation.halos))
+    pairs = ((s // n_epochs + 1, *where[s % n_epochs]) for s in shown)
+    labels = [Label(f"star {k}{epoch} flux{of_filter}", FLUX) for k, epoch, of_filter in pairs]
+    halos = range(len(observation.halos))
     labels += [Label(f"halo {k + 1} image {j + 1}", AMOUNT) for k in halos for j in images]
     if outcome.moves:
         labels += [Label(f"star {s + 1} {axis}", LENGTH) for s in shown for axis in "xy"]
@@ -108,7 +112,7 @@ def quantities_of(
     if parts:
         observed = _observed(scene)
         cutouts = [[scene.psf_on_sky(j, s) for j in images] for s in shown]
-    names = scene.observation.component_names
+    names = observation.component_names
     for part in parts:
         own, slices = part.labels(), part.slices if isinstance(part, Profile) else [part]
         held = np.zeros((len(own), n_stated))  # widths hold no light
