@@ -123,35 +123,24 @@ INLINE void take_sky(LINES lines, __global const vec *sky)
     BARRIER;
 }
 
-/* The light of the skies that an image sees: sum_k mixes_k of them. */
+/* sum_k mixes_k of the skies, in the order in which it may lie in the array of the last. */
 INLINE void mix_skies(
     HELD_LINES mixed, __global const vec *skies, __global const real *mixes, const int n_skies)
 {
-    FOR_EACH_POINT(i, NY) {
-        cvec total = {0, 0};
-        for (int k = 0; k < n_skies; ++k) {
-            __global const vec *sky = skies + (size_t)k * SPECTRA_SIZE;
-            if (mixes[k] != 0)
-                total = add(total, times(OTF_POINT(sky, i, 0, 1, PLACE_OF(i, NY)), mixes[k]));
+    bool is_first = true;
+    for (int k = n_skies - 1; k >= 0; --k) {
+        __global const vec *sky = skies + (size_t)k * SPECTRA_SIZE;
+        if (mixes[k] == 0)
+            continue;
+        FOR_EACH_POINT(i, NY) {
+            cvec a = times(OTF_POINT(sky, i, 0, 1, PLACE_OF(i, NY)), mixes[k]);
+            if (!is_first)
+                a = add(a, POINT(mixed, i));
+            SET_POINT(mixed, i, a);
         }
-        SET_POINT(mixed, i, total);
+        is_first = false;
     }
     BARRIER;
-}
-
-/* The adjoint: adds a point of an image to the skies, or puts it there where it is the first. */
-INLINE void add_to_skies(
-    __global vec *skies, const cvec a, __global const real *mixes, const int n_skies, const int i,
-    const int place, const bool is_first)
-{
-    for (int k = 0; k < n_skies; ++k) {
-        __global vec *sky = skies + (size_t)k * SPECTRA_SIZE;
-        cvec total = times(a, mixes[k]);
-        if (!is_first)
-            total = add(total, OTF_POINT(sky, i, 0, 1, place));
-        if (is_first || mixes[k] != 0)
-            SET_OTF_POINT(sky, i, place, total);
-    }
 }
 
 /* spectra_j <- IFFT(otfs_j sum_k mixes_jk FFT(skies_k)) along the columns: the row spectra of A_j of the
@@ -245,7 +234,7 @@ KERNEL void correlate_columns(
         for (int own = 0; own < n_own; ++own) {
             const int image = first + own;
             __global const vec *from = columns + IMAGE_SPECTRA(own, n_mixed);
-            __global const vec *k =
+            __global const vec *otf =
                 otfs + (size_t)image * PIXELS_SIZE + (size_t)block * NY * 2 * SIDE;
 #if HAS_TURNS
             __global const vec *phases = PHASES_OF(row_phases, image, block);
@@ -261,23 +250,31 @@ KERNEL void correlate_columns(
             forward_columns(z, from, IMAGE_NY, image_column_roots);
 #endif
             show_column_0(z, IMAGE_NY, block);
-            FOR_EACH_POINT(i, NY) {
-                const int place = PLACE_OF(i, NY);
-                cvec product =
-                    multiply_conjugate(POINT_OF_IMAGE(z, i), OTF_POINT(k, i, 0, 1, place));
-                if (block == 0 && LANE_OF(i) == 0) {
-                    __global const real *edge = otf_edges + 2 * (image * NY + place);
-                    product =
-                        add_edge(product, edge[0], -edge[1], OPPOSITE(z, i, place, OVERSAMPLE));
-                }
-                if (n_mixed > 1) {
-                    __global const real *mix = mixes + image * n_skies;
-                    add_to_skies(columns, product, mix, n_skies, i, place, own == 0);
+            for (int k = 0; k < n_mixed; ++k) {
+                __global vec *sky = columns + (size_t)k * SPECTRA_SIZE;
+                const real mix = n_mixed > 1 ? mixes[image * n_skies + k] : 1;
+                if (mix == 0 && own > 0)
                     continue;
+                FOR_EACH_POINT(i, NY) {
+                    const int place = PLACE_OF(i, NY);
+                    cvec product =
+                        multiply_conjugate(POINT_OF_IMAGE(z, i), OTF_POINT(otf, i, 0, 1, place));
+                    if (block == 0 && LANE_OF(i) == 0) {
+                        __global const real *edge = otf_edges + 2 * (image * NY + place);
+                        product =
+                            add_edge(product, edge[0], -edge[1], OPPOSITE(z, i, place, OVERSAMPLE));
+                    }
+                    if (n_mixed > 1) {
+                        product = times(product, mix);
+                        if (own > 0)
+                            product = add(product, OTF_POINT(sky, i, 0, 1, place));
+                        SET_OTF_POINT(sky, i, place, product);
+                        continue;
+                    }
+                    if (own > 0)
+                        product = add(product, POINT(held, i));
+                    SET_POINT(held, i, product);
                 }
-                if (own > 0)
-                    product = add(product, POINT(held, i));
-                SET_POINT(held, i, product);
             }
             BARRIER;
         }

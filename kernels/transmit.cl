@@ -31,9 +31,12 @@ KERNEL void transmit_rows(
                     const int pixel = q * INNER(NX);
                     __global const vec *f = FROM_POINT(extended + at, x, lane);
                     const cvec share = LOAD(FROM_POINT(t, x, lane), pixel);
-                    cvec seen = times(LOAD(f, pixel), mix[0]);
-                    for (int k = 1; k < n_skies; ++k)
-                        seen = add(seen, times(LOAD(f + (size_t)k * PIXELS_SIZE, pixel), mix[k]));
+                    cvec seen = {0, 0};
+                    for (int k = 0; k < n_skies; ++k) {
+                        if (mix[k] != 0)
+                            seen =
+                                add(seen, times(LOAD(f + (size_t)k * PIXELS_SIZE, pixel), mix[k]));
+                    }
                     a[q] = (cvec){seen.re * share.re, seen.im * share.im};
                 }
                 store_forward(OF_LANE(z, lane), a, x, NX, row_roots);
@@ -64,34 +67,44 @@ KERNEL void gather_rows(
     OF_MEMBER(steps, N_NUMBERS);
     FOR_EACH_BLOCK_IF(steps[FRESH], block, ROW_BLOCKS) {
         const size_t at = (size_t)block * NX * 2 * SIDE;
-        for (int unit = 0; unit < n_skies * n_images; ++unit) {
-            const int sky = unit / n_images, image = unit % n_images;
-            const real scale = norm * mixes[image * n_skies + sky];
-            __global const vec *t = transmission + (size_t)image * PIXELS_SIZE + at;
-            read_tiles(z, spectra + IMAGE_SPECTRA(image, n_skies), block);
-            dit_inner(z, NX, row_roots);
+        for (int sky = 0; sky < n_skies; ++sky) {
+            bool is_first = true;
+            for (int image = 0; image < n_images; ++image) {
+                const real mix = mixes[image * n_skies + sky], scale = norm * mix;
+                __global const vec *t = transmission + (size_t)image * PIXELS_SIZE + at;
+                if (mix == 0)
+                    continue;
+                read_tiles(z, spectra + IMAGE_SPECTRA(image, n_skies), block);
+                dit_inner(z, NX, row_roots);
+                FOR_EACH(piece, INNER(NX) * SIDE) {
+                    const int x = piece / SIDE, lane = piece % SIDE;
+                    cvec a[OUTER(NX)];
+                    load_inverse(a, OF_LANE(z, lane), x, NX, row_roots);
+                    UNROLL_IN_GROUPS
+                    for (int q = 0; q < OUTER(NX); ++q) {
+                        const int pixel = q * INNER(NX);
+                        __global vec *sum = FROM_POINT(transmitted + at, x, lane);
+                        const cvec share = LOAD(FROM_POINT(t, x, lane), pixel);
+                        a[q] = (cvec){scale * a[q].re * share.re, scale * a[q].im * share.im};
+                        if (!is_first)
+                            a[q] = add(a[q], LOAD(sum, pixel));
+                        STORE(sum, pixel, a[q]);
+                    }
+                }
+                BARRIER;
+                is_first = false;
+            }
             FOR_EACH(piece, INNER(NX) * SIDE) {
                 const int x = piece / SIDE, lane = piece % SIDE;
                 cvec a[OUTER(NX)];
-                load_inverse(a, OF_LANE(z, lane), x, NX, row_roots);
-                UNROLL_IN_GROUPS
-                for (int q = 0; q < OUTER(NX); ++q) {
-                    const int pixel = q * INNER(NX);
-                    __global vec *sum = FROM_POINT(transmitted + at, x, lane);
-                    const cvec share = LOAD(FROM_POINT(t, x, lane), pixel);
-                    a[q] = (cvec){scale * a[q].re * share.re, scale * a[q].im * share.im};
-                    if (image > 0)
-                        a[q] = add(a[q], LOAD(sum, pixel));
-                    STORE(sum, pixel, a[q]);
-                }
-                if (image == n_images - 1)
-                    store_forward(OF_LANE(z, lane), a, x, NX, row_roots);
+                UNROLL
+                for (int q = 0; q < OUTER(NX); ++q)
+                    a[q] = LOAD(FROM_POINT(transmitted + at, x, lane), q * INNER(NX));
+                store_forward(OF_LANE(z, lane), a, x, NX, row_roots);
             }
             BARRIER;
-            if (image == n_images - 1) {
-                dif_inner(z, NX, row_roots);
-                write_tiles(spectra + (size_t)sky * SPECTRA_SIZE, z, block, 1);
-            }
+            dif_inner(z, NX, row_roots);
+            write_tiles(spectra + (size_t)sky * SPECTRA_SIZE, z, block, 1);
         }
     }
 }
