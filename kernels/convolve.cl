@@ -19,10 +19,10 @@ INLINE cvec add_edge(const cvec a, const real re, const real im, const scalar p)
     };
 }
 
-/* otfs_image = FFT(spectra) / (4 NX NY) along the columns, made from the row spectra of a PSF: 1 / (NX NY)
- * for the inverse transforms, 1 / 4 for the two factors 2 that rfft_rows leaves. Column 0 and
+/* otfs_image = FFT(spectra_0) / (4 NX NY) along the columns, made from the row spectra of a PSF:
+ * 1 / (NX NY) for the inverse transforms, 1 / 4 for the two factors 2 that rfft_rows leaves. Column 0 and
  * otf_edges get (K_A + K_B) / 2 and (K_A - K_B) / 2.
- * spectra: n_images arrays, const, of which array 0 is read. otfs: an array an image; that of `image`
+ * spectra: N_SPECTRA arrays, const, of which array 0 is read. otfs: an array an image; that of `image`
  * is written, and its part of otf_edges, [..][NY][2]. steps[GOING] 0: nothing.
  * Launch: up to COLUMN_BLOCKS groups. Out of place. Scratch: NY points.
  * Twin: reference.otf_columns.
@@ -30,11 +30,12 @@ INLINE cvec add_edge(const cvec a, const real re, const real im, const scalar p)
 KERNEL void otf_columns(
     __global vec *restrict otfs, __global real *restrict otf_edges,
     __global const vec *restrict spectra, __global const real *restrict steps, const int image,
-    const int n_images, __global const real *restrict column_roots, SCRATCH vec *restrict scratch)
+    const int n_images, const int n_skies, __global const real *restrict column_roots,
+    SCRATCH vec *restrict scratch)
 {
     const real norm = (real)1 / 4 / NX / NY;
     LINES_IN(z, scratch, NY);
-    OF_MEMBER(spectra, (size_t)n_images * SPECTRA_SIZE);
+    OF_MEMBER(spectra, N_SPECTRA(n_images, n_skies) * SPECTRA_SIZE);
     OF_MEMBER(steps, N_NUMBERS);
     FOR_EACH_BLOCK_IF(steps[GOING], block, COLUMN_BLOCKS) {
         __global vec *k = otfs + (size_t)image * PIXELS_SIZE + (size_t)block * NY * 2 * SIDE;
@@ -103,41 +104,103 @@ INLINE cvec convolved(
     return total;
 }
 
-/* spectra_j <- IFFT(otfs_j FFT(spectra_0)) along the columns: the row spectra of A_j f from f's, in
- * every OVERSAMPLE-th row. Where each image has a sky of its own (has_skies, see transmit.cl) it is
- * FFT(spectra_j). The FFT of a sky may be held in its array, which is made last.
- * spectra: n_images arrays, written but for their padding. otfs: n_images arrays, const;
- * otf_edges: [n_images][NY][2]. row_phases (HAS_TURNS), by which rows are multiplied then:
+/* Columns of one of several skies, transformed, to its array and from there, in the order of OTFs. */
+INLINE void put_sky(__global vec *sky, const LINES lines)
+{
+    FOR_EACH_POINT(i, NY) {
+        const cvec a = POINT(lines, i);
+        SET_OTF_POINT(sky, i, PLACE_OF(i, NY), a);
+    }
+    BARRIER;
+}
+
+INLINE void take_sky(LINES lines, __global const vec *sky)
+{
+    FOR_EACH_POINT(i, NY) {
+        const cvec a = OTF_POINT(sky, i, 0, 1, PLACE_OF(i, NY));
+        SET_POINT(lines, i, a);
+    }
+    BARRIER;
+}
+
+/* The light of the skies that an image sees: sum_k mixes_k of them. */
+INLINE void mix_skies(
+    HELD_LINES mixed, __global const vec *skies, __global const real *mixes, const int n_skies)
+{
+    FOR_EACH_POINT(i, NY) {
+        cvec total = {0, 0};
+        for (int k = 0; k < n_skies; ++k) {
+            __global const vec *sky = skies + (size_t)k * SPECTRA_SIZE;
+            if (mixes[k] != 0)
+                total = add(total, times(OTF_POINT(sky, i, 0, 1, PLACE_OF(i, NY)), mixes[k]));
+        }
+        SET_POINT(mixed, i, total);
+    }
+    BARRIER;
+}
+
+/* The adjoint: adds a point of an image to the skies, or puts it there where it is the first. */
+INLINE void add_to_skies(
+    __global vec *skies, const cvec a, __global const real *mixes, const int n_skies, const int i,
+    const int place, const bool is_first)
+{
+    for (int k = 0; k < n_skies; ++k) {
+        __global vec *sky = skies + (size_t)k * SPECTRA_SIZE;
+        cvec total = times(a, mixes[k]);
+        if (!is_first)
+            total = add(total, OTF_POINT(sky, i, 0, 1, place));
+        if (is_first || mixes[k] != 0)
+            SET_OTF_POINT(sky, i, place, total);
+    }
+}
+
+/* spectra_j <- IFFT(otfs_j sum_k mixes_jk FFT(skies_k)) along the columns: the row spectra of A_j of the
+ * skies that image j sees, in every OVERSAMPLE-th row, from the skies' own; mixes count as 1 where there
+ * is one sky. With a transmission (transmit.cl) each image has its own sky, FFT(spectra_j). The FFT of a
+ * sky may be held in its array, and image 0, which has that of the last, is made last.
+ * spectra: N_SPECTRA arrays, those of the skies and of the images, written but for their padding. mixes:
+ * [n_images][n_skies]. otfs: n_images arrays, const; otf_edges: [n_images][NY][2]. row_phases
+ * (HAS_TURNS), by which rows are multiplied then:
  * [n_images][COLUMN_BLOCKS][NY / PHASE_ROWS + PHASE_ROWS][2][BLOCK]. steps[GOING] 0: nothing.
- * Launch: up to COLUMN_BLOCKS groups a sky. In place. Scratch: SCRATCH_POINTS.
- * Twin: reference.convolve_columns.
+ * Launch: up to COLUMN_BLOCKS groups; with a transmission so many an image. In place.
+ * Scratch: SCRATCH_POINTS. Twin: reference.convolve_columns.
  */
 KERNEL void convolve_columns(
     __global vec *restrict spectra, __global const vec *restrict otfs,
     __global const real *restrict otf_edges, __global const vec *restrict row_phases,
-    __global const real *restrict steps, const int n_images, const int has_skies,
-    __global const real *restrict column_roots, __global const real *restrict image_column_roots,
-    SCRATCH vec *restrict scratch)
+    __global const real *restrict mixes, __global const real *restrict steps, const int n_images,
+    const int n_skies, const int has_transmission, __global const real *restrict column_roots,
+    __global const real *restrict image_column_roots, SCRATCH vec *restrict scratch)
 {
-    const int n_own = has_skies ? 1 : n_images; /* images of one sky */
-    OF_MEMBER(spectra, (size_t)n_images * SPECTRA_SIZE);
+    const int n_own = has_transmission ? 1 : n_images; /* images of the same skies */
+    const int n_mixed = has_transmission ? 1 : n_skies;
+    OF_MEMBER(spectra, N_SPECTRA(n_images, n_skies) * SPECTRA_SIZE);
     OF_MEMBER(steps, N_NUMBERS);
     FOR_EACH_BLOCK_IF(steps[GOING], unit, COLUMN_BLOCKS * (n_images / n_own)) {
-        const int block = unit % COLUMN_BLOCKS, sky = unit / COLUMN_BLOCKS;
-        __global vec *columns =
-            spectra + (size_t)sky * SPECTRA_SIZE + (size_t)block * ROWS * 2 * SIDE;
+        const int block = unit % COLUMN_BLOCKS, first = unit / COLUMN_BLOCKS;
+        const size_t skies = has_transmission ? IMAGE_SPECTRA(first, n_skies) : 0;
+        __global vec *columns = spectra + skies + (size_t)block * ROWS * 2 * SIDE;
         LINES_AND_HELD(z, held, scratch, columns);
-        forward_columns(FIRST_HELD(z, held), columns, NY, column_roots);
-        HOLD(held, z);
+        for (int k = 0; k < n_mixed; ++k) {
+            __global vec *sky = columns + (size_t)k * SPECTRA_SIZE;
+            forward_columns(FIRST_HELD(z, held), sky, NY, column_roots);
+            if (n_mixed > 1)
+                put_sky(sky, FIRST_HELD(z, held));
+        }
+        if (n_mixed == 1)
+            HOLD(held, z);
         for (int own = n_own - 1; own >= 0; --own) {
-            const int image = sky + own;
-            __global vec *to = columns + (size_t)own * SPECTRA_SIZE;
+            const int image = first + own;
+            __global vec *to = columns + IMAGE_SPECTRA(own, n_mixed);
+            HELD_LINES seen = HELD_OR(held, n_mixed > 1 ? to : held);
+            if (n_mixed > 1)
+                mix_skies(seen, columns, mixes + image * n_skies, n_skies);
             __global const vec *k =
                 otfs + (size_t)image * PIXELS_SIZE + (size_t)block * NY * 2 * SIDE;
             __global const real *edge = otf_edges + 2 * image * NY;
-            show_column_0(held, NY, block);
+            show_column_0(seen, NY, block);
             FOR_EACH_POINT(i, IMAGE_NY)
-                SET_POINT(z, i, convolved(held, k, edge, i, block == 0 && LANE_OF(i) == 0));
+                SET_POINT(z, i, convolved(seen, k, edge, i, block == 0 && LANE_OF(i) == 0));
             BARRIER;
             dit_inner(z, IMAGE_NY, image_column_roots);
 #if HAS_TURNS
@@ -156,31 +219,32 @@ KERNEL void convolve_columns(
     }
 }
 
-/* spectra_0 <- IFFT(sum_j conj(otfs_j) FFT(spectra_j)) along the columns: the row spectrum of
- * sum_j A_j^T (r_j - w_j) from those of the r_j - w_j. Where each image has a sky of its own
- * (has_skies) spectra_j <- IFFT(conj(otfs_j) FFT(spectra_j)). Shapes as in convolve_columns; the
- * arrays of skies alone are written. steps[FRESH] 0: nothing.
- * Launch: up to COLUMN_BLOCKS groups a sky. In place. Scratch: SCRATCH_POINTS.
- * Twin: reference.correlate_columns.
+/* skies_k <- IFFT(sum_j mixes_jk conj(otfs_j) FFT(spectra_j)) along the columns: the row spectra of
+ * sum_j mixes_jk A_j^T (r_j - w_j) from those of the r_j - w_j. With a transmission
+ * spectra_j <- IFFT(conj(otfs_j) FFT(spectra_j)). Arguments as in convolve_columns; the arrays of skies
+ * alone are written. steps[FRESH] 0: nothing.
+ * Launch: up to COLUMN_BLOCKS groups; with a transmission so many an image. In place.
+ * Scratch: SCRATCH_POINTS. Twin: reference.correlate_columns.
  */
 KERNEL void correlate_columns(
     __global vec *restrict spectra, __global const vec *restrict otfs,
     __global const real *restrict otf_edges, __global const vec *restrict row_phases,
-    __global const real *restrict steps, const int n_images, const int has_skies,
-    __global const real *restrict column_roots, __global const real *restrict image_column_roots,
-    SCRATCH vec *restrict scratch)
+    __global const real *restrict mixes, __global const real *restrict steps, const int n_images,
+    const int n_skies, const int has_transmission, __global const real *restrict column_roots,
+    __global const real *restrict image_column_roots, SCRATCH vec *restrict scratch)
 {
-    const int n_own = has_skies ? 1 : n_images; /* images of one sky */
-    OF_MEMBER(spectra, (size_t)n_images * SPECTRA_SIZE);
+    const int n_own = has_transmission ? 1 : n_images; /* images of the same skies */
+    const int n_mixed = has_transmission ? 1 : n_skies;
+    OF_MEMBER(spectra, N_SPECTRA(n_images, n_skies) * SPECTRA_SIZE);
     OF_MEMBER(steps, N_NUMBERS);
     FOR_EACH_BLOCK_IF(steps[FRESH], unit, COLUMN_BLOCKS * (n_images / n_own)) {
-        const int block = unit % COLUMN_BLOCKS, sky = unit / COLUMN_BLOCKS;
-        __global vec *columns =
-            spectra + (size_t)sky * SPECTRA_SIZE + (size_t)block * ROWS * 2 * SIDE;
+        const int block = unit % COLUMN_BLOCKS, first = unit / COLUMN_BLOCKS;
+        const size_t skies = has_transmission ? IMAGE_SPECTRA(first, n_skies) : 0;
+        __global vec *columns = spectra + skies + (size_t)block * ROWS * 2 * SIDE;
         LINES_AND_HELD(z, held, scratch, columns);
         for (int own = 0; own < n_own; ++own) {
-            const int image = sky + own;
-            __global const vec *from = columns + (size_t)own * SPECTRA_SIZE;
+            const int image = first + own;
+            __global const vec *from = columns + IMAGE_SPECTRA(own, n_mixed);
             __global const vec *k =
                 otfs + (size_t)image * PIXELS_SIZE + (size_t)block * NY * 2 * SIDE;
 #if HAS_TURNS
@@ -206,14 +270,26 @@ KERNEL void correlate_columns(
                     product =
                         add_edge(product, edge[0], -edge[1], OPPOSITE(z, i, place, OVERSAMPLE));
                 }
+                if (n_mixed > 1) {
+                    __global const real *mix = mixes + image * n_skies;
+                    add_to_skies(columns, product, mix, n_skies, i, place, own == 0);
+                    continue;
+                }
                 if (own > 0)
                     product = add(product, POINT(held, i));
                 SET_POINT(held, i, product);
             }
             BARRIER;
         }
-        TAKE_HELD(z, held);
-        dit_inner(z, NY, column_roots);
-        finish_columns(columns, z, NY, column_roots);
+        if (n_mixed == 1)
+            TAKE_HELD(z, held);
+        LINES sum = FIRST_HELD(z, held);
+        for (int k = 0; k < n_mixed; ++k) {
+            __global vec *sky = columns + (size_t)k * SPECTRA_SIZE;
+            if (n_mixed > 1)
+                take_sky(sum, sky);
+            dit_inner(sum, NY, column_roots);
+            finish_columns(sky, sum, NY, column_roots);
+        }
     }
 }

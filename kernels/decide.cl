@@ -24,10 +24,12 @@ enum { PAUSED, SETTLED, STUCK, NOT_FINITE };
 
 /* The Barzilai-Borwein step <D y, s> / <D y, D y> of change_sums: longer where J bends down. */
 INLINE real next_length(
-    __global const real *steps, __global const real *change_sums, __local real_sum *shared)
+    __global const real *steps, __global const real *change_sums, const int n_skies,
+    __local real_sum *shared)
 {
-    const real_sum along = sum_group(sum_pairs(change_sums, ROW_BLOCKS), shared);
-    const real_sum squared = sum_group(sum_pairs(change_sums + 2 * ROW_BLOCKS, ROW_BLOCKS), shared);
+    const int n = ROW_BLOCKS * n_skies;
+    const real_sum along = sum_group(sum_pairs(change_sums, n), shared);
+    const real_sum squared = sum_group(sum_pairs(change_sums + 2 * n, n), shared);
     const real change_step = along.sum + along.lost, change_change = squared.sum + squared.lost;
     const real length =
         change_step > 0 && change_change > 0 ? change_step / change_change : 10 * steps[ALPHA];
@@ -104,54 +106,60 @@ INLINE real flux_gradient(
 
 /* c_s = c_s0 + share change_s: stars follow a step of the extended source to where they are best,
  * to second order, with the information F of the start, and a step that was shortened as far.
- * change = -F^-1 (gradient + <cross_information, d>) within bounds; where that leads uphill,
- * -F^-1 gradient. gradient_s = -star_totals_s + prior_precision_s (c_s0 - prior_fluxes_s).
+ * change = -F^-1 (gradient + <cross_information, sum_k flux_mixes_k d_k>) within bounds, d_k the step
+ * of sky k; where that leads uphill, -F^-1 gradient.
+ * gradient_s = -star_totals_s + prior_precision_s (c_s0 - prior_fluxes_s).
  * steps: the numbers of a run (precision.cl), updated: step lengths, slope, change of the prior.
  * star_fluxes: [n_stars], in: c_s0 or what was tried, out: c_s. star_steps: [4][n_stars], c_s0 and
  * change, kept between shorter and shorter steps, and two for what is on the way.
- * star_totals: [n_stars][2]. coupling_sums: [n_stars][cross_blocks][2]. star_inverse: [n_stars]
- * [n_stars], F^-1. prior_fluxes, prior_precision: [n_stars]. step_sums: [ROW_BLOCKS][2].
- * change_sums: [2][ROW_BLOCKS][2].
+ * star_totals: [n_stars][2]. coupling_sums: [n_skies][n_stars][cross_blocks][2]. flux_mixes:
+ * [n_stars][n_skies]. star_inverse: [n_stars][n_stars], F^-1. prior_fluxes, prior_precision: [n_stars].
+ * step_sums: [n_skies][ROW_BLOCKS][2]. change_sums: [2][n_skies][ROW_BLOCKS][2].
  * Launch: one group. In place. Twin: reference.follow_stars.
  */
 KERNEL void follow_stars(
     __global real *restrict steps, __global real *restrict star_fluxes,
     __global real *restrict star_steps, __global const real *restrict star_totals,
-    __global const real *restrict coupling_sums, __global const real *restrict star_inverse,
-    __global const real *restrict prior_fluxes, __global const real *restrict prior_precision,
-    __global const real *restrict step_sums, __global const real *restrict change_sums,
-    const int n_stars, const int cross_blocks)
+    __global const real *restrict coupling_sums, __global const real *restrict flux_mixes,
+    __global const real *restrict star_inverse, __global const real *restrict prior_fluxes,
+    __global const real *restrict prior_precision, __global const real *restrict step_sums,
+    __global const real *restrict change_sums, const int n_skies, const int n_stars,
+    const int cross_blocks)
 {
     SHARED_SUMS(shared);
     OF_MEMBER(steps, N_NUMBERS);
     OF_MEMBER(star_fluxes, n_stars);
     OF_MEMBER(star_steps, 4 * n_stars);
     OF_MEMBER(star_totals, 2 * n_stars);
-    OF_MEMBER(coupling_sums, n_stars * cross_blocks * 2);
+    OF_MEMBER(coupling_sums, n_skies * n_stars * cross_blocks * 2);
     OF_MEMBER(prior_fluxes, n_stars);
-    OF_MEMBER(step_sums, 2 * ROW_BLOCKS);
-    OF_MEMBER(change_sums, 4 * ROW_BLOCKS);
+    OF_MEMBER(step_sums, 2 * ROW_BLOCKS * n_skies);
+    OF_MEMBER(change_sums, 4 * ROW_BLOCKS * n_skies);
     __global real *before = star_steps, *change = before + n_stars;
     __global real *force = change + n_stars, *pushes = force + n_stars;
     const bool is_going = steps[GOING] != 0, is_new = steps[SHORTENED] == 0;
-    const real length = next_length(steps, change_sums, shared);
+    const real length = next_length(steps, change_sums, n_skies, shared);
     const real alpha = next_alpha(steps, length);
     const bool is_first = steps[IS_FIRST] != 0;
     real share = steps[SHARE], slope = steps[SLOPE];
-    const real_sum of_sky = sum_group(sum_pairs(step_sums, ROW_BLOCKS), shared);
+    const real_sum of_sky = sum_group(sum_pairs(step_sums, ROW_BLOCKS * n_skies), shared);
     int n_tries = is_going && is_new ? 2 : 0;
     for (int attempt = 0; attempt < n_tries; ++attempt) {
         real_sum along = {of_sky.sum, of_sky.lost}, own = {0, 0};
         FOR_EACH(s, n_stars) {
             if (attempt == 0)
                 before[s] = star_fluxes[s];
-            real_sum coupling = {0, 0};
-            for (int b = s * cross_blocks; b < (attempt == 0 ? s + 1 : s) * cross_blocks; ++b) {
-                const real_sum pair = {coupling_sums[2 * b], coupling_sums[2 * b + 1]};
-                MERGE(coupling, pair);
+            real pull = 0;
+            for (int k = 0; k < (attempt == 0 ? n_skies : 0); ++k) {
+                __global const real *pairs = coupling_sums + 2 * (k * n_stars + s) * cross_blocks;
+                real_sum coupling = {0, 0};
+                for (int b = 0; b < cross_blocks; ++b) {
+                    const real_sum pair = {pairs[2 * b], pairs[2 * b + 1]};
+                    MERGE(coupling, pair);
+                }
+                pull += flux_mixes[s * n_skies + k] * (coupling.sum + coupling.lost);
             }
-            force[s] = flux_gradient(before, star_totals, prior_fluxes, prior_precision, s)
-                + (coupling.sum + coupling.lost);
+            force[s] = flux_gradient(before, star_totals, prior_fluxes, prior_precision, s) + pull;
         }
         BARRIER;
         bounded_step(change, pushes, force, before, star_inverse, n_stars, shared);
@@ -246,7 +254,7 @@ INLINE void decide(__global real *steps, __global real *objectives, const real_s
  * objectives: objectives_size reals, a compensated pair each; entry steps[RECORDED] is written.
  * data_term: [2], J_0. star_totals: [n_stars][2]. star_corrections, star_weights: [n_stars].
  * ratio_sums: [IMAGE_ROW_BLOCKS][n_images][2]. star_sums: [n_stars][n_images][star_blocks][2].
- * square_sums (mu not 0), smooth_sums (is_smoothed): [ROW_BLOCKS][2].
+ * square_sums (mu not 0), smooth_sums (is_smoothed): [n_skies][ROW_BLOCKS][2].
  * Launch: up to n_stars groups, at least one. Out of place.
  * Twin: reference.collect_sums.
  */
@@ -256,7 +264,7 @@ KERNEL void collect_sums(
     __global real *restrict star_corrections, __global const real *restrict ratio_sums,
     __global const real *restrict star_sums, __global const real *restrict square_sums,
     __global const real *restrict smooth_sums, __global const real *restrict star_weights,
-    const int is_smoothed, const real mu, const int n_images, const int n_stars,
+    const int is_smoothed, const real mu, const int n_images, const int n_skies, const int n_stars,
     const int star_blocks, const ulong objectives_size)
 {
     SHARED_SUMS(shared);
@@ -267,16 +275,17 @@ KERNEL void collect_sums(
     OF_MEMBER(star_corrections, n_stars);
     OF_MEMBER(ratio_sums, IMAGE_ROW_BLOCKS * n_images * 2);
     OF_MEMBER(star_sums, (size_t)n_stars * n_images * star_blocks * 2);
-    OF_MEMBER(square_sums, 2 * ROW_BLOCKS);
-    OF_MEMBER(smooth_sums, 2 * ROW_BLOCKS);
+    OF_MEMBER(square_sums, 2 * ROW_BLOCKS * n_skies);
+    OF_MEMBER(smooth_sums, 2 * ROW_BLOCKS * n_skies);
     /* Every group makes the objective: a barrier in a branch stops PoCL. */
     const real_sum data = sum_group(sum_pairs(ratio_sums, IMAGE_ROW_BLOCKS * n_images), shared);
     real_sum objective = data;
-    real_sum squares = sum_group(sum_pairs(square_sums, mu != 0 ? ROW_BLOCKS : 0), shared);
+    const int n_blocks = ROW_BLOCKS * n_skies;
+    real_sum squares = sum_group(sum_pairs(square_sums, mu != 0 ? n_blocks : 0), shared);
     squares.sum *= mu / 2;
     squares.lost *= mu / 2;
     MERGE(objective, squares);
-    const real_sum smooth = sum_group(sum_pairs(smooth_sums, is_smoothed ? ROW_BLOCKS : 0), shared);
+    const real_sum smooth = sum_group(sum_pairs(smooth_sums, is_smoothed ? n_blocks : 0), shared);
     MERGE(objective, smooth);
     if (get_group_id(0) == 0) {
         store_pair(data_term, data);

@@ -68,6 +68,13 @@ typedef PASTE(BITS, WIDTH) ivec;
 #define IMAGE_SIZE (IMAGE_NX * IMAGE_NY / LANES)       /* vectors */
 #define SPECTRA_SIZE (COLUMN_BLOCKS * ROWS * 2 * SIDE) /* vectors */
 
+/* Arrays of spectra: those of the skies, and from that of the last sky on those of the images. Image 0
+ * is made last, and read first, so that it shares an array with a sky; with one sky it is array 0.
+ */
+#define N_SPECTRA(n_images, n_skies) ((size_t)((n_images) + (n_skies) - 1))
+#define SPECTRA_OF_SKY(spectra, unit) ((spectra) + (size_t)((unit) / ROW_BLOCKS) * SPECTRA_SIZE)
+#define IMAGE_SPECTRA(image, n_skies) ((size_t)((image) + (n_skies) - 1) * SPECTRA_SIZE)
+
 /* Without it PoCL leaves calls behind, and registers go through memory. */
 #define INLINE static inline __attribute__((always_inline))
 /* For loops over registers: what is not unrolled early goes through memory. */

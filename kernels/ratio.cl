@@ -120,7 +120,7 @@ INLINE void compare(
 
 /* m_j = A_j f + sum_s c_s P_js + b_j;  r_j = w_j g_j / m_j;  spectra <- row spectra of r_j - w_j;
  * ratio_sums: J_0 = sum w_j (g_j ln(g_j / m_j) + m_j - g_j); star_sums: <P_js, r_j - w_j>.
- * spectra: n_images arrays, in: row spectra of A_j f, out: twice the row spectra of r_j - w_j.
+ * spectra: N_SPECTRA arrays, of the images in: row spectra of A_j f, out: twice those of r_j - w_j.
  * images: n_images arrays of pixels, negative where not observed.
  * background: n_images arrays of pixels (has_background_map), or of one point, [2][BLOCK].
  * exposure: n_images arrays of pixels, w (has_exposure_map), or one point, [2][BLOCK], for all.
@@ -140,13 +140,13 @@ KERNEL void ratio_rows(
     __global const vec *restrict exposure, const int has_exposure_map,
     __global const vec *restrict star_images, __global const int *restrict star_corners,
     __global const int *restrict star_near, __global const real *restrict star_fluxes,
-    __global const real *restrict steps, const int n_images, const int n_stars,
+    __global const real *restrict steps, const int n_images, const int n_skies, const int n_stars,
     const int star_blocks, const int star_columns, __global const real *restrict image_row_roots,
     SCRATCH vec *restrict scratch)
 {
     SHARED_SUMS(shared);
     LINES_IN(wide, scratch, NX + (OVERSAMPLE > 1 ? IMAGE_NX : 0));
-    OF_MEMBER(spectra, (size_t)n_images * SPECTRA_SIZE);
+    OF_MEMBER(spectra, N_SPECTRA(n_images, n_skies) * SPECTRA_SIZE);
     OF_MEMBER(ratio_sums, IMAGE_ROW_BLOCKS * n_images * 2);
     OF_MEMBER(star_sums, (size_t)n_stars * n_images * star_blocks * 2);
     OF_MEMBER(images, (size_t)n_images * IMAGE_SIZE);
@@ -154,7 +154,7 @@ KERNEL void ratio_rows(
     OF_MEMBER(steps, N_NUMBERS);
     FOR_EACH_BLOCK_IF(steps[GOING], unit, IMAGE_ROW_BLOCKS * n_images) {
         const int block = unit / n_images, image = unit % n_images;
-        __global vec *row_spectra = spectra + (size_t)image * SPECTRA_SIZE;
+        __global vec *row_spectra = spectra + IMAGE_SPECTRA(image, n_skies);
         read_tiles(wide, row_spectra, block);
         LINES z = fold_rows(wide);
         dit_inner(z, IMAGE_NX, image_row_roots);

@@ -81,7 +81,8 @@ INLINE int column_of(const int pixel, const int corner, const int n)
     LINES_IN(z, scratch, NY)
 #define FIRST_HELD(z, held) held
 #define HOLD(held, z)
-#define TAKE_HELD(z, held) z = held
+#define TAKE_HELD(z, held)
+#define HELD_OR(held, other) held
 
 /* Where a point of a line lies in the exchange: with one number of padding in 16 passes meet few bank
  * conflicts.

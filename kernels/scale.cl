@@ -36,16 +36,16 @@ INLINE vec scale_points(
 }
 
 /* f <- f (1 + a u) / (1 + (mu + curvature) f a), u = c + curvature f - slope,
- * c = sum_j A_j^T (r_j - w_j), a = 1 / sum_j A_j^T w_j, and 1 + a u not below 0;
+ * c = sum_j A_j^T (r_j - w_j), a = 1 / sum_j A_j^T w_j, and 1 + a u not below 0, of each sky;
  * spectra <- row spectrum of the new f; square_sums: sum f^2; the stars, with p_s = star_weights_s:
  * c_s <- c_s (p_s star_corrections_s + q_s c0_s) / (p_s + q_s c_s), by the prior (c0_s, q_s).
- * spectra: n_images arrays, of which array 0 is in: row spectrum of c, out: twice the row spectrum of f.
- * extended: one array of pixels, f. inverse_weight: one array of pixels, a (has_weights), or
- * one point, [2][BLOCK], for all. slope, curvature: one array of pixels each, const, those of f
- * (is_smoothed; else they count as 0). square_sums: [ROW_BLOCKS][2].
+ * spectra: N_SPECTRA arrays, the first n_skies in: row spectra of c, out: twice the row spectra of f.
+ * extended: n_skies arrays of pixels, f. inverse_weight: n_skies arrays of pixels, a (has_weights), or
+ * one point, [2][BLOCK], for all. slope, curvature: n_skies arrays of pixels each, const, those of f
+ * (is_smoothed; else they count as 0). square_sums: [n_skies][ROW_BLOCKS][2].
  * star_fluxes, star_corrections, star_weights, prior_fluxes, prior_precision: [n_stars].
  * steps[GOING] 0: nothing.
- * Launch: up to ROW_BLOCKS groups. In place. Scratch: NX points. Twin: reference.scale_rows.
+ * Launch: up to ROW_BLOCKS groups a sky. In place. Scratch: NX points. Twin: reference.scale_rows.
  */
 KERNEL void scale_rows(
     __global vec *restrict spectra, __global vec *restrict extended,
@@ -55,19 +55,21 @@ KERNEL void scale_rows(
     __global const real *restrict prior_precision, __global const vec *restrict slope,
     __global const vec *restrict curvature, __global const real *restrict steps,
     const int has_weights, const int is_smoothed, const real mu, const int n_stars,
-    const int n_images, __global const real *restrict row_roots, SCRATCH vec *restrict scratch)
+    const int n_images, const int n_skies, __global const real *restrict row_roots,
+    SCRATCH vec *restrict scratch)
 {
     SHARED_SUMS(shared);
     LINES_IN(z, scratch, NX);
-    OF_MEMBER(spectra, (size_t)n_images * SPECTRA_SIZE);
-    OF_MEMBER(extended, PIXELS_SIZE);
-    OF_MEMBER(square_sums, 2 * ROW_BLOCKS);
-    OF_MEMBER(slope, PIXELS_SIZE);
-    OF_MEMBER(curvature, PIXELS_SIZE);
+    OF_MEMBER(spectra, N_SPECTRA(n_images, n_skies) * SPECTRA_SIZE);
+    OF_MEMBER(extended, (size_t)n_skies * PIXELS_SIZE);
+    OF_MEMBER(square_sums, 2 * ROW_BLOCKS * n_skies);
+    OF_MEMBER(slope, (size_t)n_skies * PIXELS_SIZE);
+    OF_MEMBER(curvature, (size_t)n_skies * PIXELS_SIZE);
     OF_MEMBER(steps, N_NUMBERS);
-    FOR_EACH_BLOCK_IF(steps[GOING], block, ROW_BLOCKS) {
-        const size_t at = (size_t)block * NX * 2 * SIDE;
-        read_tiles(z, spectra, block);
+    FOR_EACH_BLOCK_IF(steps[GOING], unit, ROW_BLOCKS * n_skies) {
+        __global vec *row_spectra = SPECTRA_OF_SKY(spectra, unit);
+        const size_t at = (size_t)unit * NX * 2 * SIDE;
+        read_tiles(z, row_spectra, unit % ROW_BLOCKS);
         dit_inner(z, NX, row_roots);
         vec_sum total = {0, 0};
         FOR_EACH(piece, INNER(NX) * SIDE) {
@@ -90,10 +92,10 @@ KERNEL void scale_rows(
             ACCUMULATE(total, squares);
             store_forward(OF_LANE(z, lane), a, x, NX, row_roots);
         }
-        store_pair(square_sums + 2 * block, sum_group(sum_lanes(total), shared));
+        store_pair(square_sums + 2 * unit, sum_group(sum_lanes(total), shared));
         BARRIER;
         dif_inner(z, NX, row_roots);
-        write_tiles(spectra, z, block, 1);
+        write_tiles(row_spectra, z, unit % ROW_BLOCKS, 1);
     }
     if (get_group_id(0) == 0) {
         OF_MEMBER(star_fluxes, n_stars);

@@ -48,7 +48,8 @@ INLINE int in_line(const int pixel, const int n)
 #define SET_OTF_POINT(k, i, place, value) STORE((k) + (i) % SIDE, place, value)
 
 /* A block of columns is held while it goes through the images: in the scratch where that has room for
- * two blocks, else in array 0 of the spectra. The lines that are to be held are made in FIRST_HELD.
+ * two blocks, else in array 0 of the spectra, or by HELD_OR in another. The lines that are to be held
+ * are made in FIRST_HELD.
  */
 #if SCRATCH_BLOCKS > 1
 #define HELD SCRATCH
@@ -58,7 +59,8 @@ INLINE int in_line(const int pixel, const int n)
     SCRATCH vec *z = held + 2 * NY * SIDE
 #define FIRST_HELD(z, held) held
 #define HOLD(held, z)
-#define TAKE_HELD(z, held) z = held
+#define TAKE_HELD(z, held)
+#define HELD_OR(held, other) held
 #else
 #define HELD __global
 #define SCRATCH_POINTS NY
@@ -68,6 +70,7 @@ INLINE int in_line(const int pixel, const int n)
 #define FIRST_HELD(z, held) z
 #define HOLD(held, z) COPY_COLUMNS(held, z)
 #define TAKE_HELD(z, held) COPY_COLUMNS(z, held)
+#define HELD_OR(held, other) other
 #define COPY_COLUMNS(to, from)     \
     do {                           \
         FOR_EACH(i, NY * 2 * SIDE) \

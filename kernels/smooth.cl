@@ -1,5 +1,6 @@
 /* The edge-preserving term: the sum of (beta + beta') / 2 psi(f - f') over the pairs of pixels that share
- * an edge, round the grid's own edges too, psi(t) = sqrt(t^2 + delta^2) - delta.
+ * an edge, round the grid's own edges too, psi(t) = sqrt(t^2 + delta^2) - delta. Where there are several
+ * skies each has a beta and a delta, and neighbours among them are pairs too.
  */
 
 /* A point of slope or curvature, which only scenes that are smoothed have. The penalty is an argument, no
@@ -112,33 +113,67 @@ INLINE vec_sum smooth_block(
     return total;
 }
 
-/* slope = sum over the four neighbours of (beta + beta') / 2 psi'(f - f'),
- * curvature = the same sum of psi'(t) / t; smooth_sums: the sum of (beta + beta') / 2 psi over all pairs.
- * extended: one array of pixels, const, f. slope, curvature: one array of pixels each, written.
- * smoothing_map: one array of pixels, const, beta (has_smoothing_map; else beta is the number
- * smoothing). smooth_sums: [ROW_BLOCKS][2]. edge: delta. steps[GOING] 0: nothing.
- * Launch: up to ROW_BLOCKS groups. Out of place. Twin: reference.smooth.
+/* Adds the pairs of the pixels from `at` on with those of another sky to slope and curvature of the block;
+ * this item's share of the sum of psi, of which the other sky has the other half.
+ */
+INLINE vec_sum smooth_between(
+    __global vec *slope, __global vec *curvature, __global const vec *extended, const real beta,
+    const real delta, const size_t at, const size_t other)
+{
+    vec_sum total = {0, 0};
+    FOR_EACH(piece, NX * SIDE) {
+        const int x = piece / SIDE, lane = piece % SIDE;
+        const cvec f = LOAD(extended + at + lane, x), g = LOAD(extended + other + lane, x);
+        cvec s = LOAD(slope + at + lane, x), c = LOAD(curvature + at + lane, x);
+        add_pair(&s.re, &c.re, (vec)beta, f.re - g.re, delta);
+        add_pair(&s.im, &c.im, (vec)beta, f.im - g.im, delta);
+        STORE(slope + at + lane, x, s);
+        STORE(curvature + at + lane, x, c);
+        ACCUMULATE(total, beta / 2 * (psi(f.re - g.re, delta) + psi(f.im - g.im, delta)));
+    }
+    return total;
+}
+
+/* slope = sum over the four neighbours of (beta + beta') / 2 psi'(f - f') of each sky, and with the skies
+ * before and behind it of spectral psi'(f - f'); curvature = the same sum of psi'(t) / t; smooth_sums:
+ * the sum of (beta + beta') / 2 psi, or spectral psi, over all pairs.
+ * extended: n_skies arrays of pixels, const, f. slope, curvature: n_skies arrays of pixels, written.
+ * smoothing_map: n_skies arrays of pixels, const, beta (has_smoothing_map; else beta is
+ * smoothing). smooth_sums: [n_skies][ROW_BLOCKS][2]. smoothing, edge: [n_skies], beta and delta > 0;
+ * delta is the mean of two skies' between them. steps[GOING] 0: nothing.
+ * Launch: up to ROW_BLOCKS groups a sky. Out of place. Twin: reference.smooth.
  */
 KERNEL void smooth(
     __global vec *restrict slope, __global vec *restrict curvature,
     __global real *restrict smooth_sums, __global const vec *restrict extended,
     __global const vec *restrict smoothing_map, __global const real *restrict steps,
-    const int has_smoothing_map, const real smoothing, const real edge)
+    const int has_smoothing_map, __global const real *restrict smoothing,
+    __global const real *restrict edge, const real spectral, const int n_skies)
 {
     SHARED_SUMS(shared);
-    OF_MEMBER(slope, PIXELS_SIZE);
-    OF_MEMBER(curvature, PIXELS_SIZE);
-    OF_MEMBER(smooth_sums, 2 * ROW_BLOCKS);
-    OF_MEMBER(extended, PIXELS_SIZE);
+    OF_MEMBER(slope, (size_t)n_skies * PIXELS_SIZE);
+    OF_MEMBER(curvature, (size_t)n_skies * PIXELS_SIZE);
+    OF_MEMBER(smooth_sums, 2 * ROW_BLOCKS * n_skies);
+    OF_MEMBER(extended, (size_t)n_skies * PIXELS_SIZE);
     OF_MEMBER(steps, N_NUMBERS);
-    FOR_EACH_BLOCK_IF(steps[GOING], block, ROW_BLOCKS) {
+    FOR_EACH_BLOCK_IF(steps[GOING], unit, ROW_BLOCKS * n_skies) {
+        const int sky = unit / ROW_BLOCKS, block = unit % ROW_BLOCKS;
+        const size_t start = (size_t)sky * PIXELS_SIZE, at = (size_t)unit * NX * 2 * SIDE;
+        __global vec *down = slope + start, *curved = curvature + start;
+        __global const vec *f = extended + start, *map = smoothing_map + has_smoothing_map * start;
         vec_sum total;
         if (has_smoothing_map)
-            total =
-                smooth_block(slope, curvature, extended, smoothing_map, 1, smoothing, edge, block);
+            total = smooth_block(down, curved, f, map, 1, smoothing[sky], edge[sky], block);
         else
-            total =
-                smooth_block(slope, curvature, extended, smoothing_map, 0, smoothing, edge, block);
-        store_pair(smooth_sums + 2 * block, sum_group(sum_lanes(total), shared));
+            total = smooth_block(down, curved, f, map, 0, smoothing[sky], edge[sky], block);
+        for (int k = max(sky - 1, 0); k < (spectral != 0 ? min(sky + 2, n_skies) : 0); ++k) {
+            const size_t other = at + (size_t)k * PIXELS_SIZE - start;
+            const real delta = (edge[sky] + edge[k]) / 2;
+            vec_sum between = {0, 0};
+            if (k != sky)
+                between = smooth_between(slope, curvature, extended, spectral, delta, at, other);
+            MERGE(total, between);
+        }
+        store_pair(smooth_sums + 2 * unit, sum_group(sum_lanes(total), shared));
     }
 }

@@ -28,15 +28,15 @@ INLINE cvec scaling_at(
     };
 }
 
-/* gradient' = mu f + slope - c, c = sum_j A_j^T (r_j - w_j);
+/* gradient' = mu f + slope - c, c = sum_j A_j^T (r_j - w_j), of each sky;
  * change_sums: <D y, s> and <D y, D y>, y = gradient' - gradient, s = f - previous,
  * D = (f + shift) a / (1 + (mu + curvature) (f + shift) a), a = 1 / sum_j A_j^T w_j.
- * spectra: n_images arrays, const, of which array 0 is the row spectrum of c.
- * gradient: one array of pixels, updated. extended
- * (f), previous, shift: one each, const. inverse_weight: one array of pixels, a (has_weights), or
- * one point, [2][BLOCK], for all. slope, curvature: one array of pixels each, const, those of f (is_smoothed;
- * else they count as 0). change_sums: [2][ROW_BLOCKS][2]. steps[FRESH] 0: nothing.
- * Launch: up to ROW_BLOCKS groups. In place. Scratch: NX points. Twin: reference.gradient_rows.
+ * spectra: N_SPECTRA arrays, const, of which the first n_skies are the row spectra of c.
+ * gradient: n_skies arrays of pixels, updated. extended
+ * (f), previous, shift: n_skies each, const. inverse_weight: n_skies arrays of pixels, a (has_weights),
+ * or one point, [2][BLOCK], for all. slope, curvature: n_skies arrays of pixels each, const, those of f
+ * (is_smoothed; else they count as 0). change_sums: [2][n_skies][ROW_BLOCKS][2]. steps[FRESH] 0: nothing.
+ * Launch: up to ROW_BLOCKS groups a sky. In place. Scratch: NX points. Twin: reference.gradient_rows.
  */
 KERNEL void gradient_rows(
     __global const vec *restrict spectra, __global real *restrict change_sums,
@@ -45,21 +45,21 @@ KERNEL void gradient_rows(
     __global const vec *restrict inverse_weight, __global const vec *restrict slope,
     __global const vec *restrict curvature, __global const real *restrict steps,
     const int has_weights, const int is_smoothed, const real mu, const int n_images,
-    __global const real *restrict row_roots, SCRATCH vec *restrict scratch)
+    const int n_skies, __global const real *restrict row_roots, SCRATCH vec *restrict scratch)
 {
     SHARED_SUMS(shared);
     LINES_IN(z, scratch, NX);
-    OF_MEMBER(spectra, (size_t)n_images * SPECTRA_SIZE);
-    OF_MEMBER(change_sums, 4 * ROW_BLOCKS);
-    OF_MEMBER(gradient, PIXELS_SIZE);
-    OF_MEMBER(extended, PIXELS_SIZE);
-    OF_MEMBER(previous, PIXELS_SIZE);
-    OF_MEMBER(slope, PIXELS_SIZE);
-    OF_MEMBER(curvature, PIXELS_SIZE);
+    OF_MEMBER(spectra, N_SPECTRA(n_images, n_skies) * SPECTRA_SIZE);
+    OF_MEMBER(change_sums, 4 * ROW_BLOCKS * n_skies);
+    OF_MEMBER(gradient, (size_t)n_skies * PIXELS_SIZE);
+    OF_MEMBER(extended, (size_t)n_skies * PIXELS_SIZE);
+    OF_MEMBER(previous, (size_t)n_skies * PIXELS_SIZE);
+    OF_MEMBER(slope, (size_t)n_skies * PIXELS_SIZE);
+    OF_MEMBER(curvature, (size_t)n_skies * PIXELS_SIZE);
     OF_MEMBER(steps, N_NUMBERS);
-    FOR_EACH_BLOCK_IF(steps[FRESH], block, ROW_BLOCKS) {
-        const size_t at = (size_t)block * NX * 2 * SIDE;
-        read_tiles(z, spectra, block);
+    FOR_EACH_BLOCK_IF(steps[FRESH], unit, ROW_BLOCKS * n_skies) {
+        const size_t at = (size_t)unit * NX * 2 * SIDE;
+        read_tiles(z, SPECTRA_OF_SKY(spectra, unit), unit % ROW_BLOCKS);
         dit_inner(z, NX, row_roots);
         finish_rows(z, NX, row_roots);
         vec_sum change_step = {0, 0}, change_change = {0, 0};
@@ -78,9 +78,10 @@ KERNEL void gradient_rows(
             ACCUMULATE(change_change, change.re * change.re + change.im * change.im);
             STORE(OWN_LINE(gradient + at, i), ALONG(i), next);
         }
-        store_pair(change_sums + 2 * block, sum_group(sum_lanes(change_step), shared));
+        store_pair(change_sums + 2 * unit, sum_group(sum_lanes(change_step), shared));
         store_pair(
-            change_sums + 2 * (ROW_BLOCKS + block), sum_group(sum_lanes(change_change), shared));
+            change_sums + 2 * (ROW_BLOCKS * n_skies + unit),
+            sum_group(sum_lanes(change_change), shared));
         BARRIER;
     }
 }
@@ -88,16 +89,16 @@ KERNEL void gradient_rows(
 /* previous = f; f <- f + d, d = P(f - alpha D gradient) - f, P the projection on f >= 0; where the
  * last step was refused f <- previous + SHORTER (f - previous) instead, which shortens d.
  * spectra <- row spectrum of f; step_sums: <gradient, d>;
- * coupling_sums: <cross_information_s, d>; square_sums: sum f^2.
- * spectra: n_images arrays, of which array 0 is out: twice the row spectrum.
- * extended (f): one array of pixels, updated.
- * previous: one, written, or read. gradient, shift: one each, const; inverse_weight, curvature: as
+ * coupling_sums: <cross_information_s, d>; square_sums: sum f^2; of each sky.
+ * spectra: N_SPECTRA arrays, of which the first n_skies are out: twice the row spectra.
+ * extended (f): n_skies arrays of pixels, updated.
+ * previous: as many, written, or read. gradient, shift: as many, const; inverse_weight, curvature: as
  * for gradient_rows, which has D and change_sums. steps[GOING] 0: nothing.
  * cross_information: [n_stars], a window of cross_blocks blocks and cross_columns columns each;
  * cross_corners: [n_stars][2]; cross_near: the stars of each block, see stars.cl.
- * coupling_sums: [n_stars][cross_blocks][2].
- * step_sums, square_sums: [ROW_BLOCKS][2].
- * Launch: up to ROW_BLOCKS groups. In place. Scratch: NX points. Twin: reference.step_rows.
+ * coupling_sums: [n_skies][n_stars][cross_blocks][2].
+ * step_sums, square_sums: [n_skies][ROW_BLOCKS][2].
+ * Launch: up to ROW_BLOCKS groups a sky. In place. Scratch: NX points. Twin: reference.step_rows.
  */
 KERNEL void step_rows(
     __global vec *restrict spectra, __global vec *restrict extended,
@@ -108,25 +109,26 @@ KERNEL void step_rows(
     __global const vec *restrict cross_information, __global const int *restrict cross_corners,
     __global const int *restrict cross_near, __global const real *restrict steps,
     __global const real *restrict change_sums, const int has_weights, const int is_smoothed,
-    const real mu, const int n_images, const int n_stars, const int cross_blocks,
+    const real mu, const int n_images, const int n_skies, const int n_stars, const int cross_blocks,
     const int cross_columns, __global const real *restrict row_roots, SCRATCH vec *restrict scratch)
 {
     SHARED_SUMS(shared);
     LINES_IN(z, scratch, NX);
-    OF_MEMBER(spectra, (size_t)n_images * SPECTRA_SIZE);
-    OF_MEMBER(extended, PIXELS_SIZE);
-    OF_MEMBER(step_sums, 2 * ROW_BLOCKS);
-    OF_MEMBER(coupling_sums, n_stars * cross_blocks * 2);
-    OF_MEMBER(square_sums, 2 * ROW_BLOCKS);
-    OF_MEMBER(previous, PIXELS_SIZE);
-    OF_MEMBER(gradient, PIXELS_SIZE);
-    OF_MEMBER(curvature, PIXELS_SIZE);
+    OF_MEMBER(spectra, N_SPECTRA(n_images, n_skies) * SPECTRA_SIZE);
+    OF_MEMBER(extended, (size_t)n_skies * PIXELS_SIZE);
+    OF_MEMBER(step_sums, 2 * ROW_BLOCKS * n_skies);
+    OF_MEMBER(coupling_sums, n_skies * n_stars * cross_blocks * 2);
+    OF_MEMBER(square_sums, 2 * ROW_BLOCKS * n_skies);
+    OF_MEMBER(previous, (size_t)n_skies * PIXELS_SIZE);
+    OF_MEMBER(gradient, (size_t)n_skies * PIXELS_SIZE);
+    OF_MEMBER(curvature, (size_t)n_skies * PIXELS_SIZE);
     OF_MEMBER(steps, N_NUMBERS);
-    OF_MEMBER(change_sums, 4 * ROW_BLOCKS);
-    const real alpha = next_alpha(steps, next_length(steps, change_sums, shared));
+    OF_MEMBER(change_sums, 4 * ROW_BLOCKS * n_skies);
+    const real alpha = next_alpha(steps, next_length(steps, change_sums, n_skies, shared));
     const bool is_new = steps[SHORTENED] == 0;
-    FOR_EACH_BLOCK_IF(steps[GOING], block, ROW_BLOCKS) {
-        const size_t at = (size_t)block * NX * 2 * SIDE;
+    FOR_EACH_BLOCK_IF(steps[GOING], unit, ROW_BLOCKS * n_skies) {
+        const int sky = unit / ROW_BLOCKS, block = unit % ROW_BLOCKS;
+        const size_t at = (size_t)unit * NX * 2 * SIDE;
         const bool has_stars = cross_near[block] < cross_near[block + 1];
         vec_sum slope_total = {0, 0}, square_total = {0, 0};
         /* A pass of its own over the pixels in their order, which prefetching follows: inside the
@@ -168,8 +170,8 @@ KERNEL void step_rows(
         }
         BARRIER;
         sum_products(
-            coupling_sums, z, cross_information, cross_corners, cross_near, 1, 0, cross_blocks,
-            cross_columns, block, ROW_BLOCKS, NX, shared);
+            coupling_sums + sky * n_stars * cross_blocks * 2, z, cross_information, cross_corners,
+            cross_near, 1, 0, cross_blocks, cross_columns, block, ROW_BLOCKS, NX, shared);
         FOR_EACH(piece, INNER(NX) * SIDE) {
             const int x = piece / SIDE, lane = piece % SIDE;
             cvec a[OUTER(NX)];
@@ -178,10 +180,10 @@ KERNEL void step_rows(
                 a[q] = LOAD(FROM_POINT(extended + at, x, lane), q * INNER(NX));
             store_forward(OF_LANE(z, lane), a, x, NX, row_roots);
         }
-        store_pair(step_sums + 2 * block, sum_group(sum_lanes(slope_total), shared));
-        store_pair(square_sums + 2 * block, sum_group(sum_lanes(square_total), shared));
+        store_pair(step_sums + 2 * unit, sum_group(sum_lanes(slope_total), shared));
+        store_pair(square_sums + 2 * unit, sum_group(sum_lanes(square_total), shared));
         BARRIER;
         dif_inner(z, NX, row_roots);
-        write_tiles(spectra, z, block, 1);
+        write_tiles(SPECTRA_OF_SKY(spectra, unit), z, block, 1);
     }
 }

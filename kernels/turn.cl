@@ -130,13 +130,13 @@ INLINE void load_columns(
 }
 
 /* columns <- irfft_rows of the row spectra of an image.
- * spectra: n_images arrays, const; `count` of them from `image` on are read. columns: as many, as
+ * spectra: N_SPECTRA arrays, const; `count` of them from number `array` on are read. columns: as many, as
  * above.
  * Launch: up to count * ROW_BLOCKS groups. Out of place. Scratch: NX points. Twin: reference.irfft_sheared.
  */
 KERNEL void irfft_sheared(
     __global real *restrict columns, __global const vec *restrict spectra,
-    __global const real *restrict steps, const int image, const int count, const ulong columns_size,
+    __global const real *restrict steps, const int array, const int count, const ulong columns_size,
     const ulong spectra_size, __global const real *restrict row_roots,
     SCRATCH vec *restrict scratch)
 {
@@ -147,7 +147,7 @@ KERNEL void irfft_sheared(
     FOR_EACH_BLOCK_IF(steps[GOING], unit, count * ROW_BLOCKS) {
         const int block = unit % ROW_BLOCKS, place = unit / ROW_BLOCKS;
         __global real *own = columns + place * COLUMNS_SIZE;
-        read_tiles(z, spectra + (size_t)(image + place) * SPECTRA_SIZE, block);
+        read_tiles(z, spectra + (size_t)(array + place) * SPECTRA_SIZE, block);
         dit_inner(z, NX, row_roots);
         FOR_EACH(piece, INNER(NX) * SIDE) {
             const int x = piece / SIDE, lane = piece % SIDE;
@@ -275,16 +275,17 @@ KERNEL void unshear_columns(
 }
 
 /* spectra <- rfft_rows of the columns of an image after the adjoint of the second shear.
- * spectra: n_images arrays; `count` of them from `image` on are written, all of them but their padding.
+ * spectra: N_SPECTRA arrays; `count` of them from number `array` on are written, all of them but their
+ * padding.
  * The rest as for ratio_sheared, const.
  * Launch: up to count * ROW_BLOCKS groups. Out of place. Scratch: NX points. Twin: reference.rfft_sheared.
  */
 KERNEL void rfft_sheared(
     __global vec *restrict spectra, __global const real *restrict ratio_columns,
     __global const int *restrict column_shifts, __global const real *restrict column_weights,
-    __global const real *restrict steps, const int image, const int count, const ulong spectra_size,
-    const ulong ratio_columns_size, __global const real *restrict row_roots,
-    SCRATCH vec *restrict scratch)
+    __global const real *restrict steps, const int image, const int array, const int count,
+    const ulong spectra_size, const ulong ratio_columns_size,
+    __global const real *restrict row_roots, SCRATCH vec *restrict scratch)
 {
     SCRATCH vec *z = OWN_SCRATCH(scratch, 2 * TURN_POINTS);
     OF_MEMBER(spectra, spectra_size / LANES);
@@ -297,7 +298,7 @@ KERNEL void rfft_sheared(
             column_weights + turn * NX * TURN_TAPS, block, -1, 0);
         begin_rows(z, NX, row_roots);
         dif_inner(z, NX, row_roots);
-        write_tiles(spectra + (size_t)turn * SPECTRA_SIZE, z, block, 1);
+        write_tiles(spectra + (size_t)(array + place) * SPECTRA_SIZE, z, block, 1);
     }
 }
 

@@ -47,6 +47,8 @@ CASES = {
         FOUR_TIMES_AS_FINE,
         "s",
     ),
+    "two skies": ((12, 40), Tuning(2, 2, chunk=2), harness.TWO_SKIES, "s"),
+    "group, two skies": ((16, 32), ON_GPU, harness.TWO_SKIES, "s"),
     "group, in registers": (
         (24, 40),
         Tuning(1, 2, group=4, points=20),

@@ -8,8 +8,8 @@ import numpy as np
 import pyopencl as cl
 import pytest
 from kernel_comparison import ALLOWED, deviation, kernels_of
-from kernel_harness import THREE_IMAGES, TURNED, TWICE_AS_FINE, KernelHarness, inputs
-from kernel_scenes import FOUR_TIMES_AS_FINE, SCENES
+from kernel_harness import THREE_IMAGES, TURNED, TWICE_AS_FINE, TWO_SKIES, KernelHarness, inputs
+from kernel_scenes import FOUR_TIMES_AS_FINE, SCENES, THREE_FINE_SKIES, TWO_TURNED_SKIES
 
 from lnocl.core.opencl import sources
 from lnocl.core.opencl.device import choose, context_of
@@ -63,6 +63,29 @@ CASES = {
     "sky four times as fine": ((64, 32), None, FOUR_TIMES_AS_FINE, "S"),
     "sky four times as fine, radices 8, 8, 4": ((64, 1024), None, FOUR_TIMES_AS_FINE, "D"),
     "sky four times as fine, group": ((128, 64), Tuning(1, 8, group=4), FOUR_TIMES_AS_FINE, "S"),
+    "two skies, odd factors 3 and 5": ((48, 80), None, TWO_SKIES, "sD"),
+    "two skies, group": ((64, 32), Tuning(1, 8, group=4), TWO_SKIES, "S"),
+    "two skies, global scratch": (
+        (64, 32),
+        Tuning(4, 16, scratch_is_global=True),
+        TWO_SKIES,
+        "S",
+    ),
+    "two skies, GPU": ((16, 32), of_gpu(16, 32), TWO_SKIES, "s"),
+    "two skies, turned": ((64, 64), None, TWO_TURNED_SKIES, "S"),
+    "three skies, twice as fine": ((32, 64), None, THREE_FINE_SKIES, "sD"),
+    "three skies, twice as fine, group": (
+        (64, 96),
+        Tuning(1, 8, group=4),
+        THREE_FINE_SKIES,
+        "S",
+    ),
+    "three skies, twice as fine, GPU": (
+        (64, 64),
+        of_gpu(64, 64, oversample=2),
+        THREE_FINE_SKIES,
+        "S",
+    ),
     "turned": ((64, 64), None, TURNED, "sD"),
     "turned, odd factors 3 and 5": ((48, 80), None, TURNED, "D"),
     "turned, several vectors a block": ((64, 32), Tuning(4, 8), TURNED, "S"),

@@ -27,7 +27,7 @@ Pairs = Iterator[tuple[NDArray, NDArray]]
 SHEARED = "irfft_sheared", "ratio_sheared", "rfft_sheared", "unshear_columns", "sample_lines"
 
 # Inputs that are numbers, by the names of the kernels' arguments.
-NUMBERS = "mu", "smoothing", "edge"
+NUMBERS = "mu", "spectral"
 
 # Worst element over largest: three times what was measured over all cases of the tests on PoCL,
 # 3.3e-7 and 1.2e-15. With divisions and roots as far off as OpenCL allows it is 5.8e-7 in single.
@@ -94,13 +94,14 @@ def _launch(
 
 
 def _put(harness: KernelHarness, name: str, values: Any) -> cl.Buffer | float | None:
-    """Return an input for a kernel: a number, pixels, their one value, or one for each star."""
+    """Return an input for a kernel: a number, pixels, their one value, or one a star or sky."""
     if name in NUMBERS:
         return float(values)
     if isinstance(values, float):
         return harness.put_points(values)
     if isinstance(values, np.ndarray):
-        return harness.put(values) if values.ndim == 1 else harness.put_pixels(values)
+        is_pixels = values.ndim > 2 and values.shape[1:] != (1, 1)
+        return harness.put_pixels(values) if is_pixels else harness.put(values)
     return None  # the scene has none
 
 
@@ -117,7 +118,7 @@ def _put_windows(harness: KernelHarness, name: str, windows: Windows) -> dict[st
 def _run_rfft_rows(harness: KernelHarness, given: SimpleNamespace) -> Pairs:
     out = harness.empty_spectra()
     _launch(harness, given, "rfft_rows", spectra=out)
-    yield harness.take_spectra(out), reference.rfft_rows(given.pixels)
+    yield harness.take_spectra(out, given.k), reference.rfft_rows(given.pixels)
 
 
 def _run_irfft_rows(harness: KernelHarness, given: SimpleNamespace) -> Pairs:
@@ -165,7 +166,13 @@ def _put_otfs(harness: KernelHarness, given: SimpleNamespace) -> dict[str, cl.Bu
         "otfs": harness.put([columns for columns, _ in parts]),
         "otf_edges": harness.put([edge for _, edge in parts]),
         "row_phases": harness.put(phases),
+        "mixes": harness.put(given.mixes),
     }
+
+
+def _mixes(given: SimpleNamespace) -> NDArray | None:
+    """Return the weights of several skies."""
+    return given.mixes if given.k > 1 else None
 
 
 def _phases(given: SimpleNamespace) -> NDArray | None:
@@ -179,57 +186,56 @@ def _run_convolve_columns(harness: KernelHarness, given: SimpleNamespace) -> Pai
     out = harness.put_spectra([*given.spectrum, *others])
     harness.launch("convolve_columns", spectra=out, **_put_otfs(harness, given))
     oversample, phases = harness.program.oversample, _phases(given)
-    expected = reference.convolve_columns(given.spectrum[0], given.otfs, oversample, phases)
+    skies = given.spectrum if given.k > 1 else given.spectrum[0]
+    expected = reference.convolve_columns(skies, given.otfs, oversample, phases, _mixes(given))
     yield harness.take_image_spectra(out, given.p), _real_edges(expected)
     # Images that have skies of their own.
-    skies = rounded(np.arange(1, given.p + 1)[:, None, None] * given.spectrum, harness.dtype)
-    out = harness.put_spectra(skies)
-    harness.launch("convolve_columns", spectra=out, has_skies=1, **_put_otfs(harness, given))
+    skies = rounded(np.arange(1, given.p + 1)[:, None, None] * given.spectrum[:1], harness.dtype)
+    out = harness.put_image_spectra(skies)
+    harness.launch("convolve_columns", spectra=out, has_transmission=1, **_put_otfs(harness, given))
     expected = reference.convolve_columns(skies, given.otfs, oversample, phases)
     yield harness.take_image_spectra(out, given.p), _real_edges(expected)
 
 
 def _run_correlate_columns(harness: KernelHarness, given: SimpleNamespace) -> Pairs:
-    out = harness.put_spectra(given.image_spectra)
+    out, phases = harness.put_image_spectra(given.image_spectra), _phases(given)
     harness.launch("correlate_columns", spectra=out, **_put_otfs(harness, given))
-    found = reference.correlate_columns(given.image_spectra, given.otfs, _phases(given))
+    found = reference.correlate_columns(given.image_spectra, given.otfs, phases, _mixes(given))
     expected = _real_edges(found)
-    yield harness.take_spectra(out)[0], expected
+    yield harness.take_spectra(out, given.k).reshape(expected.shape), expected
     others = harness.take_image_spectra(out, given.p)[1:]
     if not np.array_equal(others, _real_edges(given.image_spectra[1:])):
-        raise DeviceError("others than array 0 are written")
-    out, phases = harness.put_spectra(given.image_spectra), _phases(given)
-    harness.launch("correlate_columns", spectra=out, has_skies=1, **_put_otfs(harness, given))
+        raise DeviceError("others than those of skies are written")
+    out, first = harness.put_image_spectra(given.image_spectra), given.k - 1
+    arguments = _put_otfs(harness, given)
+    harness.launch("correlate_columns", spectra=out, has_transmission=1, **arguments)
     own = [
         reference.correlate_columns(
             given.image_spectra[j], given.otfs[j], None if phases is None else phases[j]
         )
         for j in (slice(k, k + 1) for k in range(given.p))
     ]
-    yield harness.take_spectra(out, given.p), _real_edges(np.array(own))
+    yield harness.take_spectra(out, given.p, first), _real_edges(np.array(own))
 
 
 def _run_transmit_rows(harness: KernelHarness, given: SimpleNamespace) -> Pairs:
-    out = harness.put_spectra(np.full((given.p, *given.spectrum.shape[1:]), np.nan))
-    extended, transmission = map(harness.put_pixels, (given.extended, given.transmission))
-    harness.launch("transmit_rows", spectra=out, extended=extended, transmission=transmission)
-    expected = reference.transmit_rows(given.extended, given.transmission)
-    yield harness.take_spectra(out, given.p), expected
+    out = harness.put_image_spectra(np.full((given.p, *given.spectrum.shape[1:]), np.nan))
+    _launch(harness, given, "transmit_rows", spectra=out)
+    mixes, skies = _mixes(given), given.extended
+    expected = reference.transmit_rows(skies, given.transmission, mixes)
+    yield harness.take_spectra(out, given.p, given.k - 1), expected
 
 
 def _run_gather_rows(harness: KernelHarness, given: SimpleNamespace) -> Pairs:
-    row_spectra = reference.rfft_rows(given.transmission[::-1] * given.extended - 0.3)
+    row_spectra = reference.rfft_rows(given.transmission[::-1] * given.extended[0] - 0.3)
     row_spectra = rounded(row_spectra, harness.dtype)
-    out = harness.put_spectra(row_spectra)
-    before = harness.take_spectra(out, given.p)
-    transmission = harness.put_pixels(given.transmission)
-    harness.launch(
-        "gather_rows", spectra=out, transmission=transmission, transmitted=harness.empty_pixels()
-    )
-    expected = reference.gather_rows(row_spectra, given.transmission)
-    yield harness.take_spectra(out, given.p)[0], expected
-    if not np.array_equal(harness.take_spectra(out, given.p)[1:], before[1:]):
-        raise DeviceError("others than array 0 are written")
+    out, others = harness.put_image_spectra(row_spectra), (given.p - 1, given.k)
+    before = harness.take_spectra(out, *others)
+    _launch(harness, given, "gather_rows", spectra=out, transmitted=harness.empty_pixels())
+    expected = reference.gather_rows(row_spectra, given.transmission, _mixes(given))
+    yield harness.take_spectra(out, given.k).reshape(expected.shape), expected
+    if not np.array_equal(harness.take_spectra(out, *others), before):
+        raise DeviceError("others than those of skies are written")
 
 
 def _real_edges(row_spectra: NDArray) -> NDArray:
@@ -242,7 +248,7 @@ def _run_ratio_rows(harness: KernelHarness, given: SimpleNamespace) -> Pairs:
     spectra, objective, star_sums = _twin(
         reference.ratio_rows, given, row_spectra=given.model_spectra
     )
-    out, observed = harness.put_spectra(given.model_spectra), _put_observed(harness, given)
+    out, observed = harness.put_image_spectra(given.model_spectra), _put_observed(harness, given)
     harness.launch("ratio_rows", spectra=out, **observed)
     yield harness.take_image_spectra(out, given.p), _real_edges(spectra)
     yield harness.take_sums(observed["ratio_sums"], 1), np.array([objective])
@@ -277,10 +283,11 @@ def _two_launches(given: SimpleNamespace) -> list[tuple[int, int]]:
 
 def _run_irfft_sheared(harness: KernelHarness, given: SimpleNamespace) -> Pairs:
     expected = reference.irfft_sheared(given.image_spectra)
-    spectra = harness.put_spectra(given.image_spectra)
+    spectra = harness.put_image_spectra(given.image_spectra)
     for first, count in _two_launches(given):
         out = harness.put(np.full(count * harness.program.columns_size, np.nan))
-        harness.launch("irfft_sheared", columns=out, spectra=spectra, image=first, count=count)
+        array = first + given.k - 1
+        harness.launch("irfft_sheared", columns=out, spectra=spectra, array=array, count=count)
         packed = np.array([harness.pack_columns(each) for each in expected[first : first + count]])
         yield harness.take(out, packed.shape), packed
 
@@ -333,12 +340,13 @@ def _run_ratio_sheared(harness: KernelHarness, given: SimpleNamespace) -> Pairs:
 def _run_rfft_sheared(harness: KernelHarness, given: SimpleNamespace) -> Pairs:
     shifts = np.array([each.column_shifts for each in given.rotations])
     expected = reference.rfft_sheared(given.sheared, shifts)
-    out = harness.put_spectra(np.full(given.image_spectra.shape, np.nan))
+    out = harness.put_image_spectra(np.full(given.image_spectra.shape, np.nan))
     for first, count in _two_launches(given):
         sheared = given.sheared[first : first + count]
         columns = harness.put([harness.pack_columns(each) for each in sheared])
         arrays = {"spectra": out, "ratio_columns": columns, **_put_columns(harness, given)}
-        harness.launch("rfft_sheared", image=first, count=count, **arrays)
+        numbers = {"image": first, "array": first + given.k - 1, "count": count}
+        harness.launch("rfft_sheared", **numbers, **arrays)
     yield harness.take_image_spectra(out, given.p), _real_edges(expected)
 
 
@@ -381,11 +389,14 @@ def _run_sample_lines(harness: KernelHarness, given: SimpleNamespace) -> Pairs:
         yield harness.take(found, packed.shape), packed
 
 
-def _take_star_sums(harness: KernelHarness, given: SimpleNamespace, sums: cl.Buffer) -> NDArray:
-    """Return for each star the sum of the pairs that the blocks of its window left."""
+def _take_star_sums(
+    harness: KernelHarness, given: SimpleNamespace, sums: cl.Buffer, k: int = 1
+) -> NDArray:
+    """Return for each star, or of k skies each, the sum of what the blocks of its window left."""
     if not given.n:
         return np.zeros(0)
-    return harness.take(sums, (given.n, -1)).astype(float).sum(axis=1)
+    of_all = harness.take(sums, (k, given.n, -1)).astype(float).sum(axis=2)
+    return of_all if k > 1 else of_all[0]
 
 
 def _run_scale_rows(harness: KernelHarness, given: SimpleNamespace) -> Pairs:
@@ -395,7 +406,7 @@ def _run_scale_rows(harness: KernelHarness, given: SimpleNamespace) -> Pairs:
     out, sums = harness.put_spectra(given.correction_spectra), harness.empty_sums()
     there = _launch(harness, given, "scale_rows", spectra=out, square_sums=sums)
     yield harness.take_pixels(there["extended"]), scaled
-    yield harness.take_spectra(out), spectrum
+    yield harness.take_spectra(out, given.k), spectrum
     yield harness.take(there["star_fluxes"], -1), fluxes
     if given.mu:
         yield harness.take_sums(sums, 1), np.array([squares])
@@ -413,7 +424,7 @@ def _run_smooth(harness: KernelHarness, given: SimpleNamespace) -> Pairs:
 
 def _run_collect_sums(harness: KernelHarness, given: SimpleNamespace) -> Pairs:
     rng = np.random.default_rng(7)
-    blocks, ratio_blocks = harness.program.row_blocks, harness.program.image_row_blocks
+    blocks, ratio_blocks = given.k * harness.program.row_blocks, harness.program.image_row_blocks
     ratio_sums = rounded(rng.normal(size=(ratio_blocks * given.p, 2)) + 1, harness.dtype)
     star_blocks = given.star_windows.n_blocks
     star_sums = rng.normal(size=(given.n, given.p * star_blocks, 2)) + 1
@@ -424,7 +435,7 @@ def _run_collect_sums(harness: KernelHarness, given: SimpleNamespace) -> Pairs:
     sums = {
         "objective": ratio_sums.sum(),
         "squares": square_sums.sum(),
-        "smoothness": smooth_sums.sum() if given.smoothing else 0.0,
+        "smoothness": smooth_sums.sum() if given.smoothing.any() else 0.0,
         "star_sums": star_sums.sum(axis=(1, 2)),
     }
     objective = sums["objective"] + 0.5 * given.mu * sums["squares"] + sums["smoothness"]
@@ -499,9 +510,10 @@ def _run_follow_stars(harness: KernelHarness, given: SimpleNamespace) -> Pairs:
     root = rng.normal(size=(n, 2 * n))
     inverse = rounded(root @ root.T + np.eye(n), harness.dtype)
     inverse = np.triu(inverse) + np.triu(inverse, 1).T
-    coupling = rounded(rng.uniform(-1.0, 2.0, (n, blocks, 2)), harness.dtype)
+    k, row_blocks = given.k, given.k * harness.program.row_blocks
+    coupling = rounded(rng.uniform(-1.0, 2.0, (k, n, blocks, 2)), harness.dtype)
     change = rounded(rng.normal(size=n), harness.dtype)
-    change_sums = rounded(rng.uniform(1.0, 2.0, (2, harness.program.row_blocks, 2)), harness.dtype)
+    change_sums = rounded(rng.uniform(1.0, 2.0, (2, row_blocks, 2)), harness.dtype)
     for pull, slope, numbers in (
         (-0.3, -1.0, {}),
         (0.2, -1.0, {"is_first": 0.0, "length": 0.3}),
@@ -512,7 +524,7 @@ def _run_follow_stars(harness: KernelHarness, given: SimpleNamespace) -> Pairs:
     ):
         steps = Steps(*rounded(Steps(**numbers).numbers(), harness.dtype).tolist())
         totals = rounded(rng.uniform(0.1, 0.2, (n, 2)) - pull, harness.dtype)
-        slopes = rounded(np.full((harness.program.row_blocks, 2), slope), harness.dtype)
+        slopes = rounded(np.full((row_blocks, 2), slope), harness.dtype)
         kept = harness.put([given.star_fluxes, change, change, change])
         there = _launch(
             harness,
@@ -534,7 +546,8 @@ def _run_follow_stars(harness: KernelHarness, given: SimpleNamespace) -> Pairs:
                 given.star_fluxes,
                 change,
                 totals.sum(axis=1),
-                coupling.sum(axis=(1, 2)),
+                coupling.sum(axis=(2, 3)),
+                given.flux_mixes,
                 inverse,
                 given.prior_fluxes,
                 given.prior_precision,
@@ -559,7 +572,7 @@ def _run_gradient_rows(harness: KernelHarness, given: SimpleNamespace) -> Pairs:
         reference.gradient_rows, given, row_spectrum=given.correction_spectra
     )
     spectra = harness.put_spectra(given.correction_spectra)
-    sums = harness.put(np.full((2, harness.program.row_blocks, 2), np.nan))
+    sums = harness.put(np.full((2, given.k * harness.program.row_blocks, 2), np.nan))
     there = _launch(harness, given, "gradient_rows", spectra=spectra, change_sums=sums)
     yield harness.take_pixels(there["gradient"]), expected
     found = harness.take(sums, (2, -1)).astype(float).sum(axis=1)
@@ -567,8 +580,9 @@ def _run_gradient_rows(harness: KernelHarness, given: SimpleNamespace) -> Pairs:
 
 
 def _run_step_rows(harness: KernelHarness, given: SimpleNamespace) -> Pairs:
-    windows, sums = given.cross_windows, np.zeros((2, harness.program.row_blocks, 2))
-    sums[:, :, 0] = rounded(np.array([[1.3], [0.9]]) / harness.program.row_blocks, harness.dtype)
+    windows, row_blocks = given.cross_windows, given.k * harness.program.row_blocks
+    sums = np.zeros((2, row_blocks, 2))
+    sums[:, :, 0] = rounded(np.array([[1.3], [0.9]]) / row_blocks, harness.dtype)
     for numbers in ({"alpha": float(np.float32(1.3))}, {"is_first": 0.0}, {"shortened": 1.0}):
         steps = Steps(**numbers)
         alpha, _ = next_step(steps, *sums.sum(axis=(1, 2)))
@@ -581,7 +595,7 @@ def _run_step_rows(harness: KernelHarness, given: SimpleNamespace) -> Pairs:
         out, step_sums, square_sums = (
             harness.empty_spectra(), harness.empty_sums(), harness.empty_sums()
         )  # fmt: skip
-        coupling_sums = harness.put(np.full((given.n, windows.n_blocks, 2), np.nan))
+        coupling_sums = harness.put(np.full((given.k, given.n, windows.n_blocks, 2), np.nan))
         there = _launch(
             harness,
             given,
@@ -597,10 +611,10 @@ def _run_step_rows(harness: KernelHarness, given: SimpleNamespace) -> Pairs:
         )
         yield harness.take_pixels(there["extended"]), extended
         yield harness.take_pixels(there["previous"]), before
-        yield harness.take_spectra(out), spectrum
+        yield harness.take_spectra(out, given.k), spectrum
         if slope is not None:
             yield harness.take_sums(step_sums, 1), np.array([slope])
-            yield _take_star_sums(harness, given, coupling_sums), couplings
+            yield _take_star_sums(harness, given, coupling_sums, given.k), couplings
         if given.mu:
             yield harness.take_sums(square_sums, 1), np.array([squares])
 

@@ -23,11 +23,12 @@ from lnocl.errors import DeviceError
 
 # What of a scene kernels are told as they are launched; with all else they are built.
 MAPS = "has_weights", "has_background_map", "has_exposure_map", "has_smoothing_map"
-ARGUMENTS = "n_images", "n_stars", "has_mu", "has_smoothing", *MAPS
+ARGUMENTS = "n_images", "n_skies", "n_stars", "has_mu", "has_smoothing", *MAPS
 # Scenes with all parts, together, that a program can have.
 THREE_IMAGES = "three images, two stars, mask, background map, map of smoothing"
 TWICE_AS_FINE = "sky twice as fine, three images, two stars, mask, background map"
 TURNED = "three images turned, two stars, mask, background map"
+TWO_SKIES = "two skies, three images, two stars, mask, mu, smoothing"
 SCENES: dict[str, dict[str, Any]] = {
     "plain": {"n_images": 1},
     THREE_IMAGES: {
@@ -52,6 +53,14 @@ SCENES: dict[str, dict[str, Any]] = {
         "has_weights": True,
         "has_background_map": True,
         "oversample": 2,
+    },
+    TWO_SKIES: {
+        "n_images": 3,
+        "n_skies": 2,
+        "n_stars": 2,
+        "has_mu": True,
+        "has_weights": True,
+        "has_smoothing": True,
     },
     TURNED: {
         "n_images": 3,
@@ -177,6 +186,7 @@ class KernelHarness:
         **scene: Any,
     ) -> None:
         self.n_images, self.n_stars = scene.get("n_images", 1), scene.get("n_stars", 0)
+        self.n_skies = scene.get("n_skies", 1)
         parts = {name: has for name, has in scene.items() if name not in ARGUMENTS}
         self.program = Program(context, grid, np.dtype(dtype), tuning, **parts)
         self.layout, self.launcher = SpectraLayout(self.program), Launcher(self.program)
@@ -204,7 +214,8 @@ class KernelHarness:
 
         Arguments that the scene has no use for are small arrays.
         """
-        counts = {"n_images": self.n_images, "n_stars": self.n_stars, "has_skies": 0}
+        counts = {"n_images": self.n_images, "n_stars": self.n_stars, "n_skies": self.n_skies}
+        counts["has_transmission"] = 0
         counts |= {
             "is_smoothed": int(self.scene.get("has_smoothing", False)),
             **{name: int(self.scene.get(name, False)) for name in MAPS},
@@ -236,6 +247,12 @@ class KernelHarness:
         """Return a buffer of row spectra, in the kernels' order."""
         return self.put([self.layout.pack_spectra(a) for a in row_spectra])
 
+    def put_image_spectra(self, row_spectra: Iterable[NDArray]) -> cl.Buffer:
+        """Return a buffer of the row spectra of images, behind what several skies have before."""
+        row_spectra = list(row_spectra)
+        dark = np.full((self.n_skies - 1, *self.layout.spectra_shape), np.nan)
+        return self.put([*dark, *map(self.layout.pack_spectra, row_spectra)])
+
     def put_windows(self, arrays: NDArray, windows: Windows) -> cl.Buffer:
         """Return a buffer of windows of arrays, [n_stars] or [n_stars][n_images]."""
         return self.put_pixels(
@@ -253,20 +270,20 @@ class KernelHarness:
         return np.moveaxis(pixels[rows], -1, 1)
 
     def take_pixels(self, buffer: cl.Buffer) -> NDArray:
-        """Return the one array of pixels (1, Ny, Nx) that a buffer holds."""
-        packed = self.take(buffer, self.layout.pixels_shape)
-        return self.layout.unpack_pixels(packed)[None]
+        """Return the arrays of pixels (n_skies, Ny, Nx) that a buffer holds."""
+        packed = self.take(buffer, (self.n_skies, *self.layout.pixels_shape))
+        return self.layout.unpack_pixels(packed).reshape(-1, *self.grid)
 
-    def take_spectra(self, buffer: cl.Buffer, count: int = 1) -> NDArray:
-        """Return the row spectra (count, Ny, Nx // 2 + 1) that a buffer holds."""
-        return self._take_spectra(buffer, count, self.grid[0])
+    def take_spectra(self, buffer: cl.Buffer, count: int = 1, first: int = 0) -> NDArray:
+        """Return the row spectra (count, Ny, Nx // 2 + 1) that a buffer holds, from one on."""
+        return self._take_spectra(buffer, count, self.grid[0], first)
 
     def take_image_spectra(self, buffer: cl.Buffer, count: int) -> NDArray:
         """Return the row spectra (count, ny, Nx // 2 + 1) of images that a buffer holds."""
-        return self._take_spectra(buffer, count, self.image_grid[0])
+        return self._take_spectra(buffer, count, self.image_grid[0], self.n_skies - 1)
 
-    def _take_spectra(self, buffer: cl.Buffer, count: int, ny: int) -> NDArray:
-        packed = self.take(buffer, (-1, *self.layout.spectra_shape))[:count]
+    def _take_spectra(self, buffer: cl.Buffer, count: int, ny: int, first: int) -> NDArray:
+        packed = self.take(buffer, (-1, *self.layout.spectra_shape))[first : first + count]
         return np.array([self.layout.unpack_spectra(a, ny) for a in packed])
 
     def take_sums(self, buffer: cl.Buffer, n_sums: int) -> NDArray:
@@ -274,16 +291,16 @@ class KernelHarness:
         return self.take(buffer, (-1, n_sums, 2)).astype(float).sum(axis=(0, 2))
 
     def empty_pixels(self) -> cl.Buffer:
-        """Return a buffer for one array of pixels."""
-        return self.put(np.full(self.layout.pixels_shape, np.nan))
+        """Return a buffer for an array of pixels of each sky."""
+        return self.put(np.full((self.n_skies, *self.layout.pixels_shape), np.nan))
 
     def empty_spectra(self) -> cl.Buffer:
-        """Return a buffer for one array of row spectra."""
-        return self.put(np.full(self.layout.spectra_shape, np.nan))
+        """Return a buffer for an array of row spectra of each sky."""
+        return self.put(np.full((self.n_skies, *self.layout.spectra_shape), np.nan))
 
     def empty_sums(self, n_sums: int = 1) -> cl.Buffer:
         """Return a buffer for the pairs that each block leaves of so many sums."""
-        return self.put(np.full((self.program.row_blocks, n_sums, 2), np.nan))
+        return self.put(np.full((self.n_skies * self.program.row_blocks, n_sums, 2), np.nan))
 
     def otf_parts(self, otf: NDArray) -> tuple[NDArray, NDArray]:
         """Return an OTF (Ny, Nx // 2 + 1) as the kernels keep it: columns and edge."""
@@ -318,7 +335,7 @@ def inputs(harness: KernelHarness) -> SimpleNamespace:
     rng = np.random.default_rng(harness.grid[0] * 31 + harness.grid[1])
     ny, nx = harness.grid
     image = harness.image_grid
-    p, n = harness.n_images, harness.n_stars
+    p, n, k = harness.n_images, harness.n_stars, harness.n_skies
     has_map, has_weights, has_exposure_map, has_mu, has_smoothing, has_smoothing_map = (
         harness.scene.get(f"has_{what}", False)
         for what in (
@@ -351,15 +368,26 @@ def inputs(harness: KernelHarness) -> SimpleNamespace:
         each = zip(angles, shifts, scales, strict=True)
         box = range(image[0]), range(image[1])
         rotations = [Rotation(a, at, image, box, scale) for a, at, scale in each]
+    mixes = rng.uniform(0.5, 1.5, (p, k))
+    mixes[:1, 1:] = 0.0  # the first image shows the first sky alone, where there are several
+
+    def of_skies(number: float) -> NDArray:
+        """Return numbers of the skies, from one on."""
+        return own(number * (1.0 + 0.25 * np.arange(k)).reshape(-1, 1, 1))
+
     return SimpleNamespace(
         p=p,
         n=n,
+        k=k,
+        mixes=own(mixes) if k > 1 else np.ones((p, 1)),
+        flux_mixes=own(rng.uniform(0.5, 1.5, (n, k))) if k > 1 else np.ones((n, 1)),
+        spectral=float(np.float32(0.15)) if has_smoothing and k > 1 else 0.0,
         rotations=rotations,
         shears=[Shears(rotation) for rotation in rotations],
         sheared=own(rng.uniform(0.5, 3.0, (p, ny, nx))),
-        pixels=own(rng.normal(size=(1, ny, nx))),
+        pixels=own(rng.normal(size=(k, ny, nx))),
         columns=own(rng.normal(size=(ny, nx // 2)) + 1j * rng.normal(size=(ny, nx // 2))),
-        spectrum=half_spectra(1),
+        spectrum=half_spectra(k),
         otfs=own(np.fft.rfft2(rng.normal(size=(p, ny, nx))) / (ny * nx)),
         model_spectra=own(np.fft.rfft(model, axis=-1) / nx),
         image_spectra=half_spectra(p)[:, : image[0]],
@@ -375,24 +403,24 @@ def inputs(harness: KernelHarness) -> SimpleNamespace:
         star_corrections=own(rng.uniform(0.9, 1.1, n)),
         prior_fluxes=own(rng.uniform(0.1, 1.0, n)),
         prior_precision=own(rng.uniform(0.5, 1.0, n)),
-        extended=own(rng.random((1, ny, nx))),
-        correction_spectra=own(np.fft.rfft(rng.uniform(-4.0, 8.0, (1, ny, nx)), axis=-1) / nx),
+        extended=own(rng.random((k, ny, nx))),
+        correction_spectra=own(np.fft.rfft(rng.uniform(-4.0, 8.0, (k, ny, nx)), axis=-1) / nx),
         inverse_weight=(
-            own(np.where(rng.random((1, ny, nx)) > 0.2, rng.random((1, ny, nx)), 0.0))
+            own(np.where(rng.random((k, ny, nx)) > 0.2, rng.random((k, ny, nx)), 0.0))
             if has_weights
             else 1.0 / p
         ),
         # A step of so much less than f here, of more there, where the projection cuts it off; most
         # changes have one sign, so that their sums are not small differences.
-        previous=own(rng.random((1, ny, nx)) * 0.5),
-        gradient=own(rng.uniform(-0.2, 2.0, (1, ny, nx))),
-        shift=own(rng.random((1, ny, nx))),
+        previous=own(rng.random((k, ny, nx)) * 0.5),
+        gradient=own(rng.uniform(-0.2, 2.0, (k, ny, nx))),
+        shift=own(rng.random((k, ny, nx))),
         transmission=own(rng.random((p, ny, nx))),
-        slope=own(rng.uniform(-0.5, 1.0, (1, ny, nx))) if has_smoothing else 0.0,
-        curvature=own(rng.random((1, ny, nx))) if has_smoothing else 0.0,
-        smoothing=float(np.float32(0.4)) if has_smoothing else 0.0,
-        smoothing_map=own(rng.random((1, ny, nx))) if has_smoothing_map else None,
-        edge=float(np.float32(0.3)),
+        slope=own(rng.uniform(-0.5, 1.0, (k, ny, nx))) if has_smoothing else 0.0,
+        curvature=own(rng.random((k, ny, nx))) if has_smoothing else 0.0,
+        smoothing=of_skies(0.4 if has_smoothing else 0.0),
+        smoothing_map=own(rng.random((k, ny, nx))) if has_smoothing_map else None,
+        edge=of_skies(0.3),
         cross_information=cross_information,
         mu=float(np.float32(0.25)) if has_mu else 0.0,
     )

@@ -85,7 +85,12 @@ class Transform:
 
     def _bind(self, name: str) -> Launch:
         return self.launcher.bind(
-            name, spectra=self._spectra, pixels=self._pixels, steps=self._steps, n_images=1
+            name,
+            spectra=self._spectra,
+            pixels=self._pixels,
+            steps=self._steps,
+            n_images=1,
+            n_skies=1,
         )
 
     def _upload(self, buffer: cl.Buffer, packed: NDArray) -> None:

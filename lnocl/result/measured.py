@@ -359,7 +359,9 @@ class Measured:
         parts = read_parts(regions, profiles, header, self._findings.observation)
         return bootstrap(outcome, n, parts, seed, progress, earlier, callback, parallel)
 
-    def significance(self, width: float = 0.0, false_alarms: float = 0.01) -> Significance:
+    def significance(
+        self, width: float = 0.0, false_alarms: float = 0.01, images_of: str | None = None
+    ) -> Significance:
         """Return which sources there are beside the stars, at a rate of false alarms.
 
         Each place of the sky is tested for a source, under the model without it: stars, background
@@ -375,6 +377,9 @@ class Measured:
         false_alarms : float, optional
             Number of false alarms expected in the whole field, from 1e-200 to 10. The threshold
             follows from it.
+        images_of : str, optional
+            With components the filter whose images are tested, such as "line + continuum": what
+            they show is one sky.
 
         Returns
         -------
@@ -386,6 +391,7 @@ class Measured:
         InputError
             - A width or number of false alarms is out of range.
             - The result is of tiles.
+            - With components no filter is named, or one that there is not.
             - Nowhere do the images tell such a source from stars, level and edges.
 
         Examples
@@ -404,4 +410,4 @@ class Measured:
         width = in_unit("width", width, "pix")
         false_alarms = in_unit("false_alarms", false_alarms, "")
 
-        return significance(self._outcome, width, false_alarms)
+        return significance(self._outcome.of_filter(images_of), width, false_alarms)

@@ -137,7 +137,7 @@ def details(result: Result) -> list[str]:
 
 def _star_rows(result: Result, unit: Unit) -> list[tuple[str, str]]:
     """Return label and flux of each star, of one epoch or of several."""
-    n, shown = result._observation.n_epochs, []
+    n, shown, word = result._observation.n_epochs, [], result._observation.epoch_word
     stars = result.star_positions[::n], result.star_fluxes, result.star_flux_errors
     fluxes, errors = (np.reshape(each, (-1, n)) for each in stars[1:])
     for k, (place, flux, error) in enumerate(zip(stars[0], fluxes, errors, strict=True), 1):
@@ -150,7 +150,7 @@ def _star_rows(result: Result, unit: Unit) -> list[tuple[str, str]]:
                 with_error(end(flux[seen]) / unit.electrons, middle / unit.electrons).split(" +- ")
                 for end in (np.min, np.max)
             )
-            words = f"{low[0]} to {' +- '.join(high)} {unit.name} in {seen.sum()} epochs"
+            words = f"{low[0]} to {' +- '.join(high)} {unit.name} in {seen.sum()} {word}s"
         shown.append((f"star {k} {_rounded(place)}", words))
     n_more = len(shown) - MAX_LISTED
     return shown if n_more <= 1 else [*shown[:MAX_LISTED], (f"{n_more} more stars", "in its table")]

@@ -56,8 +56,8 @@ def faults(result: Result) -> list[str]:
     """
     findings, at_stars, overall = result._findings, result.star_residuals(), result.fit()
     labels = findings.observation.epoch_labels
-    n_epochs = len(labels)
-    unfitted, held, lit, dark, lost, paired = (_Told(labels) for _ in range(6))
+    n_epochs, word = len(labels), findings.observation.epoch_word
+    unfitted, held, lit, dark, lost, paired = (_Told(labels, word) for _ in range(6))
     most, of_cores = min(findings.observation.psf_error, PSF_ERROR), 0.0
     for s, (place, given, flux, found) in enumerate(
         zip(
@@ -146,8 +146,8 @@ def is_doubt(fault: str) -> bool:
 class _Told:
     """What is told of stars, once of each, whatever epochs it is of."""
 
-    def __init__(self, epoch_labels: Sequence[str]) -> None:
-        self._labels = epoch_labels
+    def __init__(self, epoch_labels: Sequence[str], word: str) -> None:
+        self._labels, self._word = epoch_labels, word
         self._found: dict[int, list[tuple[int, str, str, float]]] = {}
 
     def __len__(self) -> int:
@@ -169,7 +169,8 @@ class _Told:
     def _of_star(self, found: list[tuple[int, str, str, float]]) -> str:
         epoch, place, more, _ = found[0]
         n = len(found)
-        when = f" in {counted(n, 'epoch') if n > 1 else f'epoch {self._labels[epoch]}'}"
+        one = "images of" if self._word == "filter" else self._word
+        when = f" in {counted(n, self._word) if n > 1 else f'{one} {self._labels[epoch]}'}"
         ends = [f"{100 * end([share for *_, share in found]):.0f}" for end in (min, max)]
         shares = "" if ends[0] == "nan" else f", {' to '.join(dict.fromkeys(ends))} %"
         return f"{place}{when * (len(self._labels) > 1)}{more}{shares}"
@@ -177,6 +178,7 @@ class _Told:
 
 def _elsewhere(extended: Array, place: Array, finer: int) -> str:
     """Return where the brightest light near a star without light is, and what to do."""
+    extended = extended.reshape(-1, *extended.shape[-2:]).sum(axis=0)
     x, y = np.round(on_sky(place, finer)).astype(int)
     reach = ELSEWHERE * finer
     rows, columns = (slice(max(at - reach, 0), max(at + reach + 1, 0)) for at in (y, x))

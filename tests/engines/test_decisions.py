@@ -35,7 +35,8 @@ def follow(steps, before, change, star, coupling, slope=-1.0, information=1.0):
         np.array(before),
         change,
         np.full(n, -star),
-        np.full(n, coupling),
+        np.full((1, n), coupling),
+        np.ones((n, 1)),
         np.eye(n) / information,
         np.zeros(n),
         np.zeros(n),
@@ -62,7 +63,14 @@ def test_alpha_is_the_smaller_of_two_steps_of_barzilai_and_borwein(changes, alph
     steps, found = Steps(), []
     for each in changes:
         follow_stars(
-            steps, *[NO_STARS] * 4, np.eye(0), *[NO_STARS] * 2, -1.0, next_step(steps, *each)
+            steps,
+            *[NO_STARS] * 3,
+            np.zeros((1, 0)),
+            np.ones((0, 1)),
+            np.eye(0),
+            *[NO_STARS] * 2,
+            -1.0,
+            next_step(steps, *each),
         )
         found.append(steps.alpha)
     assert found == alphas

@@ -23,7 +23,8 @@ def a_start(solver, prior):
 def value(prior, fluxes):
     """Return its term, as a step from the flux that is known finds it."""
     steps = Steps(shortened=1.0, share=1.0)
-    arrays = prior.fluxes, fluxes - prior.fluxes, *[np.zeros(3)] * 2, np.eye(3)
+    sums = np.zeros(3), np.zeros((1, 3)), np.ones((3, 1))
+    arrays = prior.fluxes, fluxes - prior.fluxes, *sums, np.eye(3)
     follow_stars(steps, *arrays, prior.fluxes, prior.precision, 0.0, (1.0, 1.0))
     return steps.prior_change
 

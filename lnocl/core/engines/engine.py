@@ -86,3 +86,8 @@ class Engine(Protocol):
 
     def restore(self, state: State) -> None:
         """Continue from this state."""
+
+
+def has_weights(scene: Scene) -> bool:
+    """Return whether pixels of the extended source differ in ``sum_j A_j^T w_j``."""
+    return scene.weights is not None or scene.mixes is not None

@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 
+from lnocl.core.engines.engine import has_weights
 from lnocl.core.opencl.layout import Layout
 from lnocl.core.opencl.memory import held_bytes
 from lnocl.core.opencl.program import Program
@@ -27,16 +28,18 @@ def buffer_sizes(
     scene: Scene, program: Program, layout: Layout, stars: StarWindows, n_iter: int
 ) -> dict[str, int]:
     """Return the bytes of each buffer, by the name that the kernels have for it."""
-    p, n, item = scene.n_images, scene.n_fluxes, program.dtype.itemsize
+    p, n, item, k = scene.n_images, scene.n_fluxes, program.dtype.itemsize, scene.n_skies
     pixels, image, pair = layout.pixels_bytes, layout.images.pixels_bytes, 2 * item
+    skies, block_sums = k * pixels, k * program.row_blocks * pair
     point = layout.block_bytes // program.grid[1]
     return {
         "images": p * image,
         "otfs": p * pixels,
         "otf_edges": p * program.grid[0] * pair,
-        "spectra": p * layout.spectra_bytes,
-        "extended": pixels,
-        "inverse_weight": pixels if scene.weights is not None else point,
+        "spectra": (p + k - 1) * layout.spectra_bytes,
+        "mixes": p * k * item,
+        "extended": skies,
+        "inverse_weight": skies if has_weights(scene) else point,
         "background": p * (image if has_background_map(scene) else point),
         "exposure": p * image if scene.has_exposure_map else point,
         "star_images": max(p * stars.bytes, item),
@@ -47,11 +50,13 @@ def buffer_sizes(
         "star_sums": max(p * stars.n_blocks_of_all, 1) * pair,
         "ratio_sums": program.image_row_blocks * p * pair,
         "data_term": pair,
-        "square_sums": program.row_blocks * pair,
-        "slope": pixels if scene.is_smoothed else item,
-        "curvature": pixels if scene.is_smoothed else item,
-        "smoothing_map": pixels if scene.smoothing_map is not None else item,
-        "smooth_sums": program.row_blocks * pair,
+        "square_sums": block_sums,
+        "slope": skies if scene.is_smoothed else item,
+        "curvature": skies if scene.is_smoothed else item,
+        "smoothing_map": skies if scene.smoothing_map is not None else item,
+        "smooth_sums": block_sums,
+        "smoothing": k * item,
+        "edge": k * item,
         "objectives": (n_iter + 1) * pair,
         "steps": N_STEPS * item,
         "row_phases": item,
@@ -64,15 +69,17 @@ def scaling_sizes(
     scene: Scene, program: Program, layout: Layout, cross: StarWindows
 ) -> dict[str, int]:
     """Return those of the buffers that scaled steps need besides."""
-    pixels, item = layout.pixels_bytes, program.dtype.itemsize
+    item, k = program.dtype.itemsize, scene.n_skies
+    skies, block_sums = k * layout.pixels_bytes, k * program.row_blocks * 2 * item
     return {
-        "previous": pixels,
-        "gradient": pixels,
-        "shift": pixels,
-        "change_sums": program.row_blocks * 4 * item,
+        "previous": skies,
+        "gradient": skies,
+        "shift": skies,
+        "change_sums": 2 * block_sums,
+        "flux_mixes": max(scene.n_fluxes, 1) * k * item,
         "star_inverse": max(scene.n_fluxes, 1) ** 2 * item,
         "star_steps": max(scene.n_fluxes, 1) * 4 * item,
-        "step_sums": program.row_blocks * 2 * item,
+        "step_sums": block_sums,
         **cross_sizes(scene, program, cross),
     }
 
@@ -84,7 +91,7 @@ def cross_sizes(scene: Scene, program: Program, cross: StarWindows) -> dict[str,
         "cross_information": max(cross.bytes, item),
         "cross_corners": max(scene.n_fluxes, 1) * 8,
         "cross_near": cross.near.nbytes,
-        "coupling_sums": max(cross.n_blocks_of_all, 1) * 2 * item,
+        "coupling_sums": max(scene.n_skies * cross.n_blocks_of_all, 1) * 2 * item,
     }
 
 
@@ -117,7 +124,7 @@ def host_bytes(
         Whether halves of the counts are run.
     """
     held, most = held_bytes()
-    pixels = math.prod(scene.grid)
+    pixels = math.prod(scene.sky_grid)
     frame = pixels * np.dtype(np.float64).itemsize
     to_come = COMPILER[program.is_stored] + max(2 * frame, 6 * frame - of_device)
     if scene.rotations and scaling is None:  # else the host has made its model before

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from lnocl.core.engines.engine import State
+from lnocl.core.engines.engine import State, has_weights
 from lnocl.core.reference.convolve import convolve_columns, correlate_columns, otf_columns
 from lnocl.core.reference.decide import collect_sums, follow_stars, next_step
 from lnocl.core.reference.ratio import ratio_rows
@@ -51,9 +51,9 @@ class ReferenceEngine:
             self._image_shifts = np.array([each.image_shifts for each in rotations])
         self.move_stars()
         self._inverse_weight = (
-            1.0 / scene.n_images if scene.weights is None else inverse_weight(scene, scaling)
+            inverse_weight(scene, scaling) if has_weights(scene) else 1.0 / scene.n_images
         )
-        self._slope = self._curvature = np.zeros(scene.grid)
+        self._slope = self._curvature = np.zeros(scene.sky_grid)
 
     def take_images(self) -> None:
         """Take the images that the scene has now, all else being as it was."""
@@ -123,9 +123,10 @@ class ReferenceEngine:
         """Make the ratios of the estimate; judge its objective."""
         skies = self._row_spectrum
         if (transmission := self.scene.transmission) is not None:
-            skies = transmit_rows(self._extended, transmission)
+            skies = transmit_rows(self._extended, transmission, self.scene.mixes)
         step = self.scene.oversample if self._phases is None else 1
-        row_spectra = convolve_columns(skies, self._otfs, step, self._phases)
+        mixes = self.scene.mixes if transmission is None else None
+        row_spectra = convolve_columns(skies, self._otfs, step, self._phases, mixes)
         observed = (
             self._images,
             self.scene.weights,
@@ -146,6 +147,7 @@ class ReferenceEngine:
                 self._extended,
                 self.scene.smoothing if weights is None else weights,
                 self.scene.edge,
+                self.scene.spectral_smoothing,
             )
         self._star_corrections = collect_sums(
             self._steps,
@@ -181,14 +183,14 @@ class ReferenceEngine:
         """Back-project the ratios to the correction."""
         spectra, otfs, phases = self._ratio_row_spectra, self._otfs, self._phases
         if (transmission := self.scene.transmission) is None:
-            self._row_spectrum = correlate_columns(spectra, otfs, phases)
+            self._row_spectrum = correlate_columns(spectra, otfs, phases, self.scene.mixes)
             return
         alone = [slice(j, j + 1) for j in range(len(otfs))]
         back = [
             correlate_columns(spectra[j], otfs[j], None if phases is None else phases[j])
             for j in alone
         ]
-        self._row_spectrum = gather_rows(np.array(back), transmission)
+        self._row_spectrum = gather_rows(np.array(back), transmission, self.scene.mixes)
 
     def _scale(self) -> None:
         """Scale the estimate by its correction."""
@@ -224,7 +226,7 @@ class ReferenceEngine:
 
     def _step(self) -> None:
         """Make a step from the estimate, or shorten it; let the stars follow."""
-        steps, slope, coupling = self._steps, 0.0, np.zeros(0)
+        steps, slope, coupling = self._steps, 0.0, np.zeros((1, 0))
         length = next_step(steps, *self._changes)
         if steps.shortened:
             trial, self._row_spectrum, self._squares = shortened(self._extended, self._previous)
@@ -248,6 +250,7 @@ class ReferenceEngine:
             self._change,
             self._star_sums,
             coupling,
+            self.scene.flux_mixes,
             self._star_inverse,
             *self._prior,
             slope,

@@ -11,7 +11,7 @@ import pyopencl as cl
 from numpy.typing import NDArray
 
 from lnocl.core.engines import needs
-from lnocl.core.engines.engine import State
+from lnocl.core.engines.engine import State, has_weights
 from lnocl.core.opencl.device import choose, context_of, describe, tell
 from lnocl.core.opencl.faults import guarded
 from lnocl.core.opencl.launch import Launch, Launcher
@@ -166,21 +166,22 @@ class OpenCLEngine:
         scene, rows = self.scene, self._spacing * self.scene.observation.shape[0]
         numbers = {
             "n_images": scene.n_images,
+            "n_skies": scene.n_skies,
             "n_stars": scene.n_fluxes,
             "star_blocks": self._stars.n_blocks,
             "star_columns": self._stars.n_columns,
             "cross_blocks": self._cross.n_blocks,
             "cross_columns": self._cross.n_columns,
-            "has_skies": int(scene.transmission is not None),
-            "has_weights": int(scene.weights is not None),
+            "has_transmission": int(scene.transmission is not None),
+            "has_weights": int(has_weights(scene)),
             "has_background_map": int(needs.has_background_map(scene)),
             "has_exposure_map": int(scene.has_exposure_map),
             "mu": scene.mu,
             "is_smoothed": int(scene.is_smoothed),
             "has_smoothing_map": int(scene.smoothing_map is not None),
-            "smoothing": scene.smoothing,
-            "edge": scene.edge,
+            "spectral": scene.spectral_smoothing,
             "image": 0,
+            "array": 0,
             "image_blocks": -(-rows // (2 * self.program.tuning.block)),  # that hold some of these
         }
         sizes = {f"{each}_size": self._memory.count(each) for each in self._memory.buffers}
@@ -193,11 +194,11 @@ class OpenCLEngine:
 
     def _bind_iteration(self) -> None:
         """Bind the kernels of an iteration, in its order."""
-        has_skies = self.scene.transmission is not None
-        self._convolve = self._bind_all(*["transmit_rows"] * has_skies, "convolve_columns")
-        self._correlate = self._bind_all("correlate_columns", *["gather_rows"] * has_skies)
+        is_dimmed = self.scene.transmission is not None
+        self._convolve = self._bind_all(*["transmit_rows"] * is_dimmed, "convolve_columns")
+        self._correlate = self._bind_all("correlate_columns", *["gather_rows"] * is_dimmed)
         if self._turned:
-            self._turned.bind(self._bind, self._memory)
+            self._turned.bind(self._bind, self._memory, self.scene.n_skies)
             self._compare: Callable[[], object] = self._turned.make_ratios
         else:
             self._compare = self._bind("ratio_rows")
@@ -219,7 +220,7 @@ class OpenCLEngine:
         self._upload_map("exposure", np.asarray(scene.weights if has_map else [1.0]), 0.0)
         self._upload_map("background", scene.background(), 1.0)
         if scene.smoothing_map is not None:
-            memory.upload_pixels("smoothing_map", [scene.smoothing_map])
+            self._upload_skies("smoothing_map", scene.smoothing_map)
         if scene.transmission is not None:
             memory.upload_pixels("transmission", scene.transmission)
         self._set(Steps())
@@ -228,12 +229,20 @@ class OpenCLEngine:
         memory.upload_raw("star_corners", self._stars.corners)
         memory.upload_raw("star_near", self._stars.near)
         self.move_stars()
-        if scene.weights is None:
-            memory.upload_points("inverse_weight", np.array([1.0 / scene.n_images]))
-        else:
+        ones = np.ones((scene.n_images, 1))
+        memory.upload("mixes", (ones if scene.mixes is None else scene.mixes).ravel())
+        for name in ("smoothing", "edge"):
+            memory.upload(name, np.ravel(getattr(scene, name)))
+        if has_weights(scene):
             inverse = inverse_weight(scene, self.scaling)
             self._observed = inverse > 0
-            memory.upload_pixels("inverse_weight", [inverse])
+            self._upload_skies("inverse_weight", inverse)
+        else:
+            memory.upload_points("inverse_weight", np.array([1.0 / scene.n_images]))
+
+    def _upload_skies(self, name: str, values: Array) -> None:
+        """Copy pixels of all skies to a buffer."""
+        self._memory.upload_pixels(name, values.reshape(-1, *self.scene.grid))
 
     def _upload_map(self, name: str, values: Array, beside: float) -> None:
         """Copy images to a buffer, or a value for each."""
@@ -267,7 +276,8 @@ class OpenCLEngine:
         self._upload_scaling(scaling)
 
     def _upload_scaling(self, scaling: Scaling) -> None:
-        self._memory.upload_pixels("shift", [scaling.shift])
+        self._upload_skies("shift", scaling.shift)
+        self._memory.upload("flux_mixes", self.scene.flux_mixes.ravel())
         self._memory.upload_pixels(
             "cross_information",
             (self._cross.cut(s, 0, each) for s, each in enumerate(scaling.cross_information)),
@@ -293,7 +303,8 @@ class OpenCLEngine:
         self._memory.upload("star_weights", scene.star_weights)
 
     def _make_otfs(self) -> None:
-        transform = self._bind("rfft_rows", pixels=self._memory.buffers["extended"])
+        # Of the first sky of the first member, while others rest.
+        transform = self._bind("rfft_rows", pixels=self._memory.buffers["extended"], n_skies=1)
         otf = self._bind("otf_columns")
         for j in range(self.scene.n_images):
             self._memory.upload_pixels("extended", [self.scene.psf(j)])
@@ -307,10 +318,11 @@ class OpenCLEngine:
         self.finish()  # as what is launched here is launched for other members too
         if self._observed is not None:
             extended = np.where(self._observed, extended, 0.0)
-        memory.upload_pixels("extended", [extended])
+        self._upload_skies("extended", extended)
         memory.upload("star_fluxes", star_fluxes)
         memory.clear("square_sums")
-        memory.upload("square_sums", np.einsum("yx,yx->", extended, extended))
+        rows = extended.reshape(-1, self.scene.grid[1])
+        memory.upload("square_sums", np.einsum("yx,yx->", rows, rows))
         self._judge_estimate(replace(self._first, recorded=recorded))
         if self.scaling is not None:
             memory.copy("extended", "previous")
@@ -388,7 +400,8 @@ class OpenCLEngine:
 
     def extended(self) -> NDArray[np.floating]:
         """Return the extended source, on the grid and scaled, in the precision of the device."""
-        return self.layout.unpack_pixels(self._memory.download_raw("extended"))
+        pixels = self.layout.unpack_pixels(self._memory.download_raw("extended"))
+        return pixels.reshape(self.scene.sky_grid)
 
     def star_fluxes(self) -> Array:
         """Return the star fluxes, scaled."""

@@ -196,6 +196,7 @@ class Launcher:
         if name == "ratio_rows":
             return self.program.image_row_blocks * int(arguments["n_images"])
         if name.endswith("_columns"):
-            n_skies = int(arguments["n_images"]) if arguments.get("has_skies") else 1
-            return n_skies * self.program.grid[1] // 2 // self.program.tuning.block
-        return self.program.row_blocks
+            n_own = int(arguments["n_images"]) if arguments.get("has_transmission") else 1
+            return n_own * self.program.grid[1] // 2 // self.program.tuning.block
+        n_skies = 1 if name in ("transmit_rows", "gather_rows") else int(arguments["n_skies"])
+        return n_skies * self.program.row_blocks

@@ -56,7 +56,7 @@ flags, ones = launch.READ_WRITE | cl.mem_flags.COPY_HOST_PTR, numpy.ones(2**14, 
 names = "pixels", "spectra", "steps"
 buffers = {name: cl.Buffer(context, flags, hostbuf=ones) for name in names}
 for name in ("rfft_rows", "fft_columns"):
-    launcher.bind(name, buffers, n_images=1)()
+    launcher.bind(name, buffers, n_images=1, n_skies=1)()
 launcher.queue.finish()
 """
 # Enough for a linker.

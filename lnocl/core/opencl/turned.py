@@ -111,9 +111,9 @@ class TurnedImages:
         for shears, image in zip(self.shears, images, strict=True):
             yield shears.lay(image)
 
-    def bind(self, bind: Callable[..., Launch], memory: Memory) -> None:
+    def bind(self, bind: Callable[..., Launch], memory: Memory, n_skies: int) -> None:
         """Bind the kernels; `bind` does so by a kernel's name to what all images share."""
-        self._memory = memory
+        self._memory, self._first = memory, n_skies - 1  # the spectra of image 0
         self._kernels = {
             name: bind(name, count=max(count for _, count in self._runs))
             for name in ("irfft_sheared", "ratio_sheared", "rfft_sheared")
@@ -143,12 +143,13 @@ class TurnedImages:
                 self._make_sampled(image, table)
                 table += n_lines
                 continue
-            images = {"image": image, "count": count}
-            self._launch("irfft_sheared", spectra="spectra", **images)
+            images, array = {"image": image, "count": count}, self._first + image
+            self._launch("irfft_sheared", spectra="spectra", array=array, count=count)
             self._launch("ratio_sheared", columns="columns", **images)
             self._launch(
                 "rfft_sheared",
                 spectra="spectra",
+                array=array,
                 ratio_columns="ratio_columns",
                 column_shifts="column_shifts",
                 column_weights="column_weights",
@@ -159,8 +160,8 @@ class TurnedImages:
         """Make the ratio of an image of larger pixels, whose tables begin at a line."""
         (ny, nx), rows, columns = self._program.grid, self._rows, self._columns
         back = table + ny + nx
-        self._sample("spectra", table, rows, array=image)
-        self._launch("irfft_sheared", spectra="sampled", image=0, count=1)
+        self._sample("spectra", table, rows, array=self._first + image)
+        self._launch("irfft_sheared", spectra="sampled", array=0, count=1)
         self._sample("columns", table + ny, columns)
         self._launch("ratio_sheared", columns="sampled", image=image, count=1)
         self._launch("unshear_columns", image=image)
@@ -172,9 +173,10 @@ class TurnedImages:
             column_shifts="still_shifts",
             column_weights="still_weights",
             image=0,
+            array=0,
             count=1,
         )
-        self._sample("columns", back, rows, sampled="spectra", to=image)
+        self._sample("columns", back, rows, sampled="spectra", to=self._first + image)
 
     def _sample(self, given: str, table: int, lines: dict[str, int], **other: str | int) -> None:
         """Take lines of an array in a buffer into another, by the table that begins at a line."""

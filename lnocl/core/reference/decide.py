@@ -41,6 +41,7 @@ def follow_stars(
     change: Array,
     star_sums: Array,
     coupling: Array,
+    flux_mixes: Array,
     star_inverse: Array,
     prior_fluxes: Array,
     prior_precision: Array,
@@ -59,8 +60,12 @@ def follow_stars(
         Updated.
     before, change : ndarray of float64, shape (n,)
         Fluxes before the step, and their change where it was shortened.
-    star_sums, coupling : ndarray of float64, shape (n,)
-        ``sum_j <P_js, r_j - w_j>`` before the step, and ``<cross_information_s, d>``.
+    star_sums : ndarray of float64, shape (n,)
+        ``sum_j <P_js, r_j - w_j>`` before the step.
+    coupling : ndarray of float64, shape (K, n)
+        ``<cross_information_s, d_k>``, d_k the step of each of K skies.
+    flux_mixes : ndarray of float64, shape (n, K)
+        The share of each sky in the images that show a star: ``d = sum_k flux_mixes_sk d_k``.
     star_inverse : ndarray of float64, shape (n, n)
         ``F^-1``.
     prior_fluxes, prior_precision : ndarray of float64, shape (n,)
@@ -72,7 +77,7 @@ def follow_stars(
     """
     if steps.shortened == 0:
         gradient = prior_precision * (before - prior_fluxes) - star_sums
-        for force in (gradient + coupling, gradient):
+        for force in (gradient + (flux_mixes.T * coupling).sum(axis=0), gradient):
             change = bounded_step(star_inverse, force, before)
             steps.slope = slope + float(gradient @ change)
             if steps.slope < 0:

@@ -53,13 +53,14 @@ def step_rows(
 
     ``d = P(f - alpha D gradient) - f`` with P the projection on ``f >= 0``, D as in
     `gradient_rows`, and c_s the cross information of star s; Bonettini, Zanella & Zanni (2009),
-    Inverse Problems 25, 015002.
+    Inverse Problems 25, 015002. The last has shape (K, n), of d of each of K skies.
     """
     scaling = _shifted_scaling(extended, shift, inverse_weight, mu + curvature)
     trial = np.maximum(extended - alpha * scaling * gradient, 0.0)
     direction = trial - extended
     slope = float((gradient * direction).sum())
-    coupling = (cross_information * direction).sum(axis=(-2, -1))
+    of_skies = direction.reshape(-1, 1, *direction.shape[-2:])
+    coupling = (cross_information * of_skies).sum(axis=(-2, -1))
     return trial, rfft_rows(trial), float((trial**2).sum()), slope, coupling
 
 

@@ -17,7 +17,7 @@ from lnocl.core.scene.estimate import Estimate
 from lnocl.core.scene.observation import Observation
 from lnocl.core.scene.scene import Scene
 from lnocl.core.scene.stars import MAX_SHIFT
-from lnocl.errors import in_words, warn
+from lnocl.errors import InputError, in_words, warn
 from lnocl.residuals import MUCH_EXCHANGED, StarResiduals, judge_stars
 
 if TYPE_CHECKING:
@@ -246,6 +246,49 @@ class Outcome:
             is_marginal=stars,
             has_marginal_halos=halos,
             has_levels=levels,
+        )
+
+    def of_filter(self, label: str | None) -> Outcome:
+        """Return what the images of a filter show of several skies, as the outcome of one sky.
+
+        Parameters
+        ----------
+        label : str or None
+            The name of the filter, such as "line + continuum"; None where there is one sky.
+
+        Raises
+        ------
+        InputError
+            There is no such filter, or there are several.
+        """
+        mixing, observation = self.scene.mixing, self.scene.observation
+        if mixing is None and label is None:
+            return self
+        names = observation.filter_names
+        if mixing is None or label not in names:
+            known = " or ".join(map(repr, names)) or "None, as there is one sky"
+            raise InputError(f"`images_of` is {label!r}; give {known}")
+        g = names.index(label)
+        part, row, penalty = self.estimate.parts[g], mixing.rows[g], self.scene.penalty
+        shares = np.array(penalty.shares or [1.0] * len(row))
+        near, refinement = penalty.near_stars, self.psf_refinement
+        own = replace(
+            penalty,
+            smoothing=penalty.smoothing * float(np.hypot.reduce(row * shares)),
+            near_stars=None if near is None else np.sqrt(np.einsum("k,kyx->yx", row, near**2)),
+            shares=(),
+            spectral=0.0,
+            stars=None,
+        )
+        if refinement is not None:
+            refinement = replace(refinement, may_be_faked=refinement.may_be_faked[0])
+        images = observation.of_images(part.images)
+        setup = replace(self.setup, observation=images, pad=self.scene.pad, initial_extended=None)
+        return replace(
+            self,
+            setup=replace(setup, initial_star_fluxes=None),
+            estimate=replace(part.estimate, scene=part.estimate.scene.penalised(own)),
+            psf_refinement=refinement,
         )
 
     def halo_amounts(self, fluxes: Array) -> Array:

@@ -435,6 +435,11 @@ class Observation:
         return int(self.epochs.max()) + 1
 
     @property
+    def epoch_word(self) -> str:
+        """What an epoch is called in messages: with components it is a filter."""
+        return "filter" if self.component_names else "epoch"
+
+    @property
     def n_skies(self) -> int:
         """Number of components, or 1 where there are none."""
         return max(len(self.component_names), 1)
@@ -443,6 +448,11 @@ class Observation:
     def skies_shape(self) -> tuple[int, ...]:
         """Shape of the extended source: `sky_shape`, or with several components (K, ny, nx)."""
         return (self.n_skies, *self.sky_shape) if self.component_names else self.sky_shape
+
+    @property
+    def filter_names(self) -> list[str]:
+        """The name of each filter: the components that its images show."""
+        return filter_names(self.mixing.rows, self.component_names) if self.component_names else []
 
     @property
     def mixing(self) -> Mixing:
@@ -668,8 +678,7 @@ class Observation:
         for name, field in FIELDS.items():
             if field.axes and name not in changes:
                 values = getattr(self, name)
-                is_of_images = values.ndim > field.of_images and values.shape[field.of_images] > 0
-                if is_of_images and values.size:
+                if values.ndim > field.of_images and values.shape[field.of_images] > 0:
                     changes[name] = _of_images(values, which, field.of_images)
         changes["exposure"] = self.exposure[which]
         return self._with(changes)._closed()

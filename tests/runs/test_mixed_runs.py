@@ -1,0 +1,282 @@
+"""Line and continuum in one fit: runs of several skies, their errors and replicas."""
+
+from functools import cache
+
+import numpy as np
+import pytest
+from scenes import paper
+
+import lnocl
+from lnocl.core.runs.assessment import assess
+from lnocl.core.runs.halves import Snapshot
+from lnocl.core.runs.replicas import Replicas
+from lnocl.core.scene.scene import Scene
+from lnocl.errors import InputError
+from lnocl.result.kept import from_parts, to_parts
+
+SHAPE = 16, 32
+STAR, FLUXES = (9, 8), (3e4, 2e4)
+WEIGHTS = {"line": [1, 0], "continuum": [1, 1]}
+FIXED = {"engine": "numpy", "stop": None, "n_iter": 20}
+
+
+def blob(x0, y0, width, light):
+    y, x = np.indices(SHAPE)
+    values = np.exp(-((x - x0) ** 2 + (y - y0) ** 2) / 2 / width**2)
+    return light * values / values.sum()
+
+
+LINE, CONTINUUM = blob(20, 7, 2.0, 4e4), blob(12, 10, 3.5, 6e4)
+
+
+def psfs_of(n):
+    y, x = np.indices((9, 9)) - 4
+    shapes = [np.exp(-(x**2 / (2 + 0.3 * j) + y**2 / (2.4 - 0.2 * j)) / 1.4) for j in range(n)]
+    return np.array([each / each.sum() for each in shapes])
+
+
+def models(weights=WEIGHTS, fluxes=FLUXES, background=10.0):
+    psfs = psfs_of(len(weights["line"]))
+    found = []
+    for psf, a, b, flux in zip(psfs, weights["line"], weights["continuum"], fluxes, strict=True):
+        sky = a * LINE + b * CONTINUUM
+        sky[STAR[1], STAR[0]] += flux
+        laid = np.zeros(SHAPE)
+        laid[:9, :9] = psf
+        spectrum = np.fft.rfft2(np.roll(laid, (-4, -4), (0, 1))) * np.fft.rfft2(sky)
+        found.append(np.fft.irfft2(spectrum, SHAPE) + background)
+    return np.array(found)
+
+
+def observe(seed=0, **known):
+    images = np.random.default_rng(seed).poisson(models())
+    given = {"background": 10.0, "psf_error": 0.0, "components": WEIGHTS, **known}
+    return lnocl.Observation(images, psfs_of(2), **given)
+
+
+@cache
+def result(error=0.0):
+    options = {**FIXED, "smoothing": 0.01, "pad": 0}
+    errors = {"continuum": [error, 0.0]}
+    return lnocl.deconvolve(observe(component_errors=errors), [STAR], **options)
+
+
+def test_bands_that_share_nothing_are_as_they_are_alone():
+    images = np.random.default_rng(0).poisson(models())
+    psfs, names = psfs_of(2), ("J", "K")
+    bands = {name: row for name, row in zip(names, np.eye(2), strict=True)}
+    given, options = {"background": 10.0, "psf_error": 0.0}, {"engine": "numpy", "n_iter": 15}
+    options |= {"mu": 1e-6}
+    joint = lnocl.Observation(images, psfs, components=bands, **given)
+    together = paper(joint, [STAR], **options)
+    for k in range(2):
+        alone = paper(lnocl.Observation(images[k], psfs[k], **given), [STAR], **options)
+        # They start from the same level, and the split-gradient method takes its steps pixel-wise.
+        np.testing.assert_allclose(together.extended[k], alone.extended, rtol=2e-9)
+        assert together.star_fluxes[k] == pytest.approx(alone.star_fluxes[0], rel=2e-9)
+
+
+def test_line_continuum_and_stars_come_apart():
+    found = lnocl.deconvolve(observe(), [STAR], engine="numpy")
+    for k, truth in enumerate((LINE.sum(), CONTINUUM.sum())):
+        assert abs(found.extended_flux[0][k] - truth) < 3 * found.extended_flux[1][k]
+        assert found.extended_flux[1][k] < 0.1 * truth
+    assert (abs(found.star_fluxes - FLUXES) < 3 * found.star_flux_errors).all()
+    for name, truth in (("line", LINE), ("continuum", CONTINUUM)):
+        sky = found.component(name)
+        assert np.linalg.norm(sky - truth) < 0.35 * np.linalg.norm(truth)
+    with pytest.raises(InputError, match="no component is called 'lines': line, continuum"):
+        found.component("lines")
+
+
+def test_what_is_printed_names_components_and_filters():
+    lines = str(result()).splitlines()
+    assert lines[0].split()[:2] == ["images", "of"]
+    assert [line.split()[0] for line in lines[1:5]] == ["line", "continuum", "line", "continuum"]
+    assert "epoch" not in str(result())
+    assert "nan" not in str(result())
+
+
+def test_the_order_of_components_does_not_matter():
+    turned = {"continuum": WEIGHTS["continuum"], "line": WEIGHTS["line"]}
+    options = {**FIXED, "smoothing": 0.01, "pad": 0}
+    other = lnocl.deconvolve(observe(components=turned), [STAR], **options)
+    np.testing.assert_allclose(other.extended[::-1], result().extended, rtol=1e-6, atol=1e-6)
+    np.testing.assert_allclose(other.star_fluxes, result().star_fluxes, rtol=1e-9)
+
+
+def test_weights_are_units_of_the_components():
+    halved = {"line": [0.5, 0.0], "continuum": [1, 1]}
+    options = {**FIXED, "n_iter": 15, "mu": 0.0}
+    one, other = (
+        paper(observe(components=each), [STAR], **{**options, "stop": None})
+        for each in (WEIGHTS, halved)
+    )
+    np.testing.assert_allclose(other.extended[0], 2.0 * one.extended[0], rtol=1e-9)
+    np.testing.assert_allclose(other.extended[1], one.extended[1], rtol=1e-9)
+
+
+def test_the_error_of_the_light_is_its_scatter():
+    outcome = result()._findings
+    errors = np.zeros(outcome.scene.n_fluxes)  # of stars, which are as they were found
+    model, found = np.array(list(outcome.models())), []
+    whole = np.zeros(SHAPE)
+    whole[4:12, 15:26] = 1.0
+    rng = np.random.default_rng(5)
+    for _ in range(300):
+        scene = outcome.scene.of_half(outcome.observation.replace(images=rng.poisson(model)))
+        scene.scale, scene.unit = outcome.scene.scale, outcome.scene.unit
+        drawn = lnocl.core.runs.outcome.Outcome(
+            outcome.setup,
+            lnocl.core.scene.estimate.Estimate(scene, outcome.sky, outcome.star_fluxes),
+            outcome.objectives,
+            "",
+        )
+        found.append(drawn.light().flux(whole, errors))
+    fluxes, told = np.array(found).transpose(1, 0, 2)
+    covariance = outcome.light().covariance(whole, errors)[1]
+    np.testing.assert_allclose(fluxes.std(axis=0), told.mean(axis=0), rtol=0.12)
+    assert np.cov(fluxes.T)[0, 1] == pytest.approx(covariance[0, 1], rel=0.25)
+    assert covariance[0, 1] < 0  # what the line has the continuum lacks
+
+
+def test_weights_that_are_off_are_in_the_errors_of_light():
+    sure, unsure = result(), result(0.1)
+    (_line, continuum), before = sure.extended_flux
+    after = unsure.extended_flux[1]
+    assert after[0] == pytest.approx(np.hypot(before[0], 0.1 * continuum), rel=1e-6)
+    assert after[1] == pytest.approx(before[1], rel=1e-6)
+    outcome = unsure._findings
+    drawn = [Replicas(outcome, seed)._mixed_otherwise(Replicas(outcome, seed)._model, rng)
+             for seed, rng in enumerate(map(np.random.default_rng, range(40)))]  # fmt: skip
+    weights = np.array([each.scene.mixing.weights for each in drawn])
+    assert 0.06 < weights[:, 0, 1].std() < 0.14
+    assert (weights[:, [0, 1, 1], [0, 0, 1]] == [1.0, 0.0, 1.0]).all()
+
+
+def test_replicas_measure_each_component_and_how_bright_it_is_over_the_continuum():
+    from regions import CirclePixelRegion, PixCoord
+
+    regions = [CirclePixelRegion(PixCoord(20, 7), 4)]
+    found = result().bootstrap(10, regions=regions)
+    names = [each.name for each in found.quantities]
+    assert names == [
+        "star 1 epoch 0 flux",
+        "star 1 epoch 1 flux",
+        "line region 1",
+        "continuum region 1",
+        "line / continuum region 1",
+    ]
+    values, errors = found.values, found.standard_errors
+    assert values[4] == pytest.approx(values[2] / values[3])
+    assert (errors > 0).all()
+    assert found.error_map.shape == (2, *SHAPE)
+    truth = regions[0].to_mask("exact").multiply(LINE).sum()
+    assert abs(values[2] - truth) < 3 * errors[2]
+
+
+def test_errors_begin_with_what_a_file_holds():
+    outcome, observation = result()._findings, observe()
+    parts = to_parts(outcome, observation)
+    held = from_parts(parts, observation, None, "single")
+    np.testing.assert_array_equal(held.sky, outcome.sky)
+    assert held.scene.penalty == outcome.scene.penalty
+    assert held.light().flux(np.ones(SHAPE), np.zeros(2))[0] == pytest.approx(
+        outcome.light().flux(np.ones(SHAPE), np.zeros(2))[0]
+    )
+    other = observe(components={"line": [1, 0], "continuum": [1, 0.9]})
+    assert from_parts(parts, other, None, "single") is None
+
+
+def test_a_run_resumes_bit_for_bit(tmp_path):
+    path = tmp_path / "run.fits"
+    options = {"engine": "numpy", "smoothing": 0.01, "stop": None}
+    lnocl.deconvolve(observe(), [STAR], n_iter=20, checkpoint=path, **options,
+                     callback=lambda i, _: i == 7)  # fmt: skip
+    again = lnocl.deconvolve(observe(), [STAR], n_iter=20, resume=path, **options)
+    whole = lnocl.deconvolve(observe(), [STAR], n_iter=20, **options)
+    assert again.n_iter == whole.n_iter
+    np.testing.assert_array_equal(again.extended, whole.extended)
+
+
+def test_each_sky_counts_alike_in_held_out_counts():
+    rng = np.random.default_rng(0)
+    truth = rng.random((2, *SHAPE))
+
+    def snapshot(k, faint):
+        noise = [0.1 * k * rng.standard_normal((2, *SHAPE)) for _ in range(2)]
+        lost = 1.0 - 0.8**k
+        return Snapshot(k, [faint * (lost * truth / 2 + each) for each in noise], None, None)
+
+    rng = np.random.default_rng(1)
+    one = [snapshot(k, np.ones((2, 1, 1))) for k in range(1, 9)]
+    rng = np.random.default_rng(1)
+    other = [snapshot(k, np.array([1.0, 1e-3])[:, None, None]) for k in range(1, 9)]
+    found, of_faint = (assess(each, each[-1], SHAPE) for each in (one, other))
+    assert (found.best, found.chosen) == (of_faint.best, of_faint.chosen)
+
+
+def test_a_psf_that_is_off_is_mended_in_its_filter_alone():
+    y, x = np.indices((9, 9)) - 4
+    wrong = np.exp(-(x**2 / 2.3 + y**2 / 2.2) / 2.2)
+    psfs = np.array([psfs_of(2)[0], wrong / wrong.sum()])
+    images = np.random.default_rng(2).poisson(models(fluxes=(3e6, 3e6)))
+    given = {"background": 10.0, "psf_error": 0.03, "components": WEIGHTS}
+    observation = lnocl.Observation(images, psfs, **given)
+    found = lnocl.deconvolve(observation, [STAR], engine="numpy", n_iter=60)
+    before, after = (
+        abs(each - psfs_of(2)).sum(axis=(1, 2)) for each in (observation.psfs, found.psfs)
+    )
+    assert after[1] < 0.5 * before[1]
+    assert after[0] < 0.02
+
+
+@pytest.mark.parametrize("kind", ["halos", "background_error"])
+def test_levels_and_halos_are_fitted_filter_by_filter(kind):
+    y, x = np.indices(SHAPE)
+    halo = 1.0 / (3.0 + np.hypot(x - 25, y - 12))
+    amounts = np.array([2e4, 1e4])
+    added = amounts[:, None, None] * halo / halo.sum() if kind == "halos" else 4.0
+    images = np.random.default_rng(3).poisson(models() + added)
+    more = {"halos": halo} if kind == "halos" else {"background_error": 3.0}
+    given = {"background": 10.0, "psf_error": 0.0, "components": WEIGHTS, **more}
+    found = lnocl.deconvolve(lnocl.Observation(images, psfs_of(2), **given), [STAR],
+                             engine="numpy", n_iter=100)  # fmt: skip
+    if kind == "halos":
+        assert (abs(found.halo_fluxes[0] - amounts) < 3 * found.halo_flux_errors[0]).all()
+    else:
+        first, second = found._findings.levels_in_words()
+        assert first.startswith("`images[0]`: background 1")
+        assert second.startswith("`images[1]`: background 1")
+    assert abs(found.extended_flux[0][0] - LINE.sum()) < 3 * found.extended_flux[1][0]
+
+
+def test_start_and_smoothing_are_of_each_sky():
+    scene = Scene(observe(), [STAR])
+    assert scene.sky_grid == (2, *scene.grid)
+    start = scene.start(np.ones((2, *SHAPE)) * [[[3.0]], [[5.0]]], None)[0] * scene.unit
+    assert start[0, 3, 3] == pytest.approx(3.0)
+    assert start[1, 3, 3] == pytest.approx(5.0)
+    with pytest.raises(InputError, match=r"shape \(16, 32\); it must have \(2, 16, 32\)"):
+        scene.start(np.ones(SHAPE), None)
+
+
+def test_a_point_is_found_in_the_images_of_a_filter():
+    _y, _x = np.indices((48, 48))
+    psf = psfs_of(1)[0]
+    rng = np.random.default_rng(4)
+    means = np.full((2, 48, 48), 12.0)
+    for j, flux in enumerate((4e4, 3e4)):
+        means[j, 16:25, 18:27] += flux * psf
+    means[0, 28:37, 8:17] += 600.0 * psf  # in the line alone
+    weights = {"line": [1, 0], "continuum": [1, 1]}
+    given = {"background": 12.0, "psf_error": 0.0, "components": weights}
+    observation = lnocl.Observation(rng.poisson(means), psf, **given)
+    found = lnocl.deconvolve(observation, [(22, 20)], **{**FIXED, "n_iter": 30})
+    points = found.significance(images_of="line + continuum").detections
+    assert len(points) == 1
+    assert np.hypot(points["x"][0].value - 12, points["y"][0].value - 32) < 0.3
+    assert points["flux"][0].value == pytest.approx(600.0, abs=4 * points["flux_error"][0].value)
+    assert len(found.significance(images_of="continuum").detections) == 0
+    with pytest.raises(InputError, match="give 'line \\+ continuum' or 'continuum'"):
+        found.significance()
