@@ -13,6 +13,8 @@ import lnocl
 N = 48
 STARS, FLUXES = np.array([(20.6, 25.3), (36.2, 13.4)]), np.array([1e6, 6e4])
 HOST, HOST_FLUX, HOST_WIDTH = (13.4, 36.2), 3e4, 2.5
+# Of components the host is the continuum; a knot as bright and wide is in the line.
+KNOT = 34.2, 34.7
 # Variances along x of the PSFs' cores: true, and such as are given where they are too narrow.
 TRUE, NARROW = 1.69, 1.44
 SHIFT, ANGLE, SCALE, CENTRE = (1.4, -2.3), 25.0, 0.7, (N - 1) / 2
@@ -67,7 +69,7 @@ def place_in(to_image, place):
 
 def psf_in(words, j, place, x, y, xx):
     """Return the PSF of image j at a place in it."""
-    xx = xx + 0.3 * j * ("plain" in words)
+    xx = xx + 0.3 * j * bool(words & {"plain", "components"})
     if "PSF field" not in words:
         return psf(x, y, xx)
     share = np.clip(place[0] / (N - 1), 0, 1)
@@ -81,13 +83,16 @@ def psfs(words, p, xx):
     nodes = [(0, 0), (N - 1, 0)]
     if "PSF field" not in words:
         return np.array([psf_in(words, j, nodes[0], u, v, xx) for j in range(p)])
-    return [lnocl.PsfField([psf_in(words, 0, at, u, v, xx) for at in nodes], nodes)] * p
+    fields = [[psf_in(words, j, at, u, v, xx) for at in nodes] for j in range(p)]
+    return [lnocl.PsfField(each, nodes) for each in fields]
 
 
 def light(words, j, to_image, fluxes):
     """Return stars and host in an image, electrons."""
     y, x = np.indices((2 * N, 2 * N)) - N // 2
     host = HOST_FLUX * gaussian(x - HOST[0], y - HOST[1], HOST_WIDTH**2, HOST_WIDTH**2)
+    if "components" in words and j == 0:
+        host += HOST_FLUX * gaussian(x - KNOT[0], y - KNOT[1], HOST_WIDTH**2, HOST_WIDTH**2)
     is_lit = host > 1e-6 * HOST_FLUX
     sources = [*zip(STARS, fluxes, strict=True)]
     image = np.zeros((N, N))
@@ -143,6 +148,8 @@ def observe(kind, xx=TRUE):
                 known |= {"star_psfs": behind(x, y), "star_places": STARS[0]}
             case "level":
                 known["background_error"] = 1.0
+            case "components":
+                known["components"] = {"line": [1, 0], "continuum": [1, 1]}
     means = np.array(images) + LEVELS[:p, None, None]
     counts = np.random.default_rng(31).poisson(means).astype(float)
     known["background"] = LEVELS[:p] + 0.7 * ("level" in words)
@@ -151,5 +158,6 @@ def observe(kind, xx=TRUE):
         counts, known["mask"] = ([each[0], each[1, :ny, :nx]] for each in (counts, known["mask"]))
     if "halos" in words and "several shapes" in words:
         known["halos"] = [known["halos"][0], known["halos"][0][:ny, :nx]]
-    fluxes = np.outer(FLUXES, np.unique(times)).ravel()
+    shown = times if "components" in words else np.unique(times)
+    fluxes = np.outer(FLUXES, shown).ravel()
     return lnocl.Observation(counts, psfs(words, p, xx), **known), fluxes

@@ -8,7 +8,20 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 import pytest
-from kinds import BRIGHTER, FLUXES, HOST, HOST_FLUX, NARROW, STARS, TRUE, N, X, Y, observe
+from kinds import (
+    BRIGHTER,
+    FLUXES,
+    HOST,
+    HOST_FLUX,
+    KNOT,
+    NARROW,
+    STARS,
+    TRUE,
+    N,
+    X,
+    Y,
+    observe,
+)
 
 import lnocl
 from lnocl.io.saved_results import read_result
@@ -17,11 +30,13 @@ from lnocl.io.saved_results import read_result
 KINDS = [
     *("plain", "masked", "exposures", "exposure map", "padded", "offsets", "several shapes"),
     *("turned", "scaled", "finer sky", "epochs", "halos", "PSF field", "transmission"),
-    *("star PSFs", "level"),
+    *("star PSFs", "level", "components"),
     *("turned + epochs", "turned + halos", "turned + transmission", "turned + star PSFs"),
     *("turned + finer sky", "turned + PSF field"),
     *("scaled + epochs", "several shapes + halos", "epochs + halos", "epochs + PSF field"),
     *("transmission + epochs", "finer sky + halos", "PSF field + halos", "star PSFs + epochs"),
+    *("turned + components", "finer sky + components", "epochs + components"),
+    *("halos + components", "transmission + components", "PSF field + components"),
 ]
 BRIGHT, FAINT = map(tuple, STARS.tolist())
 ROOT = Path(__file__).parents[2]
@@ -88,9 +103,10 @@ def holds_counts_out(kind):
     """They end the run where the host has its light."""
     result, q = run(kind), observe(kind)[0].oversample
     assert result.stop_reason == "held-out"
-    light = result.extended.reshape(N, q, N, q).sum(axis=(1, 3))
-    is_near = np.hypot(X - HOST[0], Y - HOST[1]) < 8
-    np.testing.assert_allclose(light[is_near].sum(), HOST_FLUX, rtol=0.1)
+    places = [KNOT, HOST] if result.component_names else [HOST]
+    for sky, (x, y) in zip(result.extended.reshape(-1, N, q, N, q), places, strict=True):
+        light, is_near = sky.sum(axis=(1, 3)), np.hypot(X - x, Y - y) < 8
+        np.testing.assert_allclose(light[is_near].sum(), HOST_FLUX, rtol=0.1)
 
 
 def makes_replicas(kind):
@@ -109,8 +125,10 @@ def works_in_parallel(kind):
 
 def detects(kind):
     """The faint star, where the bright one alone is known; and limits."""
-    found = run(kind, (BRIGHT,)).significance(false_alarms=0.01)
-    table, flux = found.detections, FLUXES[1] * (1 if "epochs" not in kind else (1 + BRIGHTER) / 2)
+    names = observe(kind)[0].filter_names or [None]
+    found = run(kind, (BRIGHT,)).significance(false_alarms=0.01, images_of=names[0])
+    varies = "epochs" in kind and names == [None]
+    table, flux = found.detections, FLUXES[1] * ((1 + BRIGHTER) / 2 if varies else 1)
     distances = np.hypot(table["x"].value - FAINT[0], table["y"].value - FAINT[1])
     nearest = table[int(distances.argmin())]
     assert distances.min() < 0.1
