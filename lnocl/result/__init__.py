@@ -161,7 +161,8 @@ class Result(Measured):
         >>> images, psf = [np.full((8, 8), 9.0), np.full((8, 8), 4.0)], np.ones((1, 1))
         >>> components = {"line": [1, 0], "continuum": [1, 1]}
         >>> observation = lnocl.Observation(images, psf, components=components)
-        >>> result = lnocl.deconvolve(observation, stop=None, n_iter=20, engine="numpy")
+        >>> options = {"smoothing": 0, "stop": None, "engine": "numpy"}
+        >>> result = lnocl.deconvolve(observation, **options)
         >>> result.component("line").mean().round(2)
         np.float64(5.0)
         """

@@ -425,7 +425,7 @@ def test_another_flux_of_a_star_is_another_run():
     sky = np.ones((4, 5))
     saved = SimpleNamespace(path="a.fits", extended=sky, star_fluxes=np.array([7.0]))
     again = RerunOfFile(saved, SimpleNamespace(electrons=2.0), None, None)
-    found = {"observation": SimpleNamespace(sky_shape=(4, 5)), "sky": 2.0 * sky}
+    found = {"observation": SimpleNamespace(sky_shape=(4, 5), skies_shape=(4, 5)), "sky": 2.0 * sky}
     again._refuse_another(SimpleNamespace(fluxes_of_stars=np.array([14.0]), **found))
     with pytest.raises(InputError, match="gives another result now"):
         again._refuse_another(SimpleNamespace(fluxes_of_stars=np.array([14.1]), **found))

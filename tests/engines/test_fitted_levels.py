@@ -41,7 +41,7 @@ def test_the_light_above_a_level_that_is_wrong_is_within_its_error(seed):
     assert abs(flux - 1.5e4) < 2.5 * error
     assert error < 1500.0
     level = result._outcome.scene.observation.background
-    middle, along_x, along_y = result._outcome.levels.errors[0]
+    middle, along_x, along_y = result._outcome.levels[0].errors[0]
     assert abs(level.mean() - LEVEL) < 2.5 * middle < 1.0
     assert abs(level[0, 0, -1] - level[0, 0, 0] - 6.0) < 2.5 * along_x
     assert abs(level[0, -1, 0] - level[0, 0, 0]) < 2.5 * along_y
@@ -73,8 +73,9 @@ def test_reported_levels_exclude_the_read_noise_term_and_bad_pixels():
     mask = np.array([[[False, True]]])
     maps = np.where(mask, 0.0, 29.0), np.where(mask, 0.0, 3.0)
     observed = {"background": maps[0], "read_noise": maps[1], "mask": mask}
-    scene = SimpleNamespace(observation=SimpleNamespace(**observed))
-    levels = SimpleNamespace(errors=np.array([[0.25]]))
-    outcome = SimpleNamespace(levels=levels, has_levels=True, scene=scene)
+    scene = SimpleNamespace(observation=SimpleNamespace(**observed), n_images=1)
+    estimate = SimpleNamespace(parts=[SimpleNamespace(images=[0])])
+    levels = [SimpleNamespace(errors=np.array([[0.25]]))]
+    outcome = SimpleNamespace(levels=levels, has_levels=True, scene=scene, estimate=estimate)
     (line,) = Outcome.levels_in_words(outcome)
     assert line.startswith("`images[0]`: background 20 +- 0.25 electrons per pixel")

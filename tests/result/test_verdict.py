@@ -86,7 +86,11 @@ def nameless(monkeypatch):
 def observed(*labels, psf_error=0.0):
     """Return what a verdict asks of an observation."""
     return SimpleNamespace(
-        n_epochs=len(labels), epoch_labels=labels, star_places=(), psf_error=psf_error
+        n_epochs=len(labels),
+        epoch_labels=labels,
+        epoch_word="epoch",
+        star_places=(),
+        psf_error=psf_error,
     )
 
 
