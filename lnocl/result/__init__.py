@@ -343,7 +343,9 @@ class Result(Measured):
         images. The primary HDU holds the extended source. The tables STARS, HISTORY, PLAN and
         MESSAGES hold the stars, the objectives, the plan, and the lines of ``print(result)``.
         HALOS holds the amounts of halos, and HELDOUT the errors that held-out counts estimate,
-        where there are any. PSFS and others are added where PSFs were refined. Extended source and
+        where there are any. With components the primary HDU is a cube of their skies, COMPONENTS
+        has their names and light, and NOISE the noise of their pixels by counts. PSFS and others
+        are added where PSFs were refined. Extended source and
         stars are in electrons, per second where exposures were given.
 
         The cubes MODELS and RESIDUALS hold `models`, in electrons, and `residuals` of each image.
