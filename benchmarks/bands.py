@@ -68,7 +68,9 @@ def main():
             shares = f"{inside[is_jet].mean():.2f} of {is_jet.sum()} rows of the jet"
             near = f"{inside[is_near].mean():.2f} of {is_near.sum()} near the star"
             print(f"{kind}, {level} %: holds the truth in {shares}, {near}")
-    figure = draw_bands(f"hh34, {given.size} x {given.size}", *parts.values(), "electrons")
+    figure = draw_bands(
+        f"hh34, {given.size} x {given.size}", {"": tuple(parts.values())}, "electrons"
+    )
     for axis, start in zip(figure.axes, (0, given.size), strict=True):
         axis.plot(
             rows - star, truth[start : start + given.size], color="black", lw=0.8, label="truth"

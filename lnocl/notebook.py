@@ -27,18 +27,19 @@ def html_card(title: str, rows: Mapping[str, object], image: NDArray[np.float64]
         Its heading.
     rows : mapping of str to object
         Texts of the table, by their names; they are escaped, but for line breaks.
-    image : ndarray, shape (ny, nx)
-        What the thumbnail shows; NaN where it is not known.
+    image : ndarray, shape (ny, nx) or (k, ny, nx)
+        What the thumbnail shows, several beside each other; NaN where it is not known.
     """
     lines = "".join(
         f"<tr><th style='text-align:left'>{html.escape(name)}</th>"
         f"<td style='text-align:left'>{_escaped(str(value))}</td></tr>"
         for name, value in rows.items()
     )
-    content = thumbnail(image)
+    planes = image.reshape(-1, *image.shape[-2:])
+    content = thumbnail(np.hstack([*planes]))
     picture = (
         f"<img alt='{html.escape(title)}' src='data:image/png;base64,{content}' "
-        f"style='width:{ON_SCREEN}px;image-rendering:pixelated'>"
+        f"style='width:{ON_SCREEN * len(planes)}px;image-rendering:pixelated'>"
         if content
         else ""
     )

@@ -23,7 +23,6 @@ from lnocl.core.runs.outcome import Outcome, mean_over_epochs
 from lnocl.core.scene.arrays import Array, number_in, whole
 from lnocl.core.scene.detector import on_sky
 from lnocl.core.scene.estimate import Estimate
-from lnocl.core.scene.observation import Observation
 from lnocl.core.scene.quantities import in_unit
 from lnocl.core.scene.texture import SHARE_NEAR
 from lnocl.core.solvers.companions import SIGNIFICANT, Companion, errors_beside, holding
@@ -425,21 +424,10 @@ class Significance:
         return draw_significance(view)
 
 
-def refuse_components(observation: Observation) -> None:
-    """Refuse to look for sources in several skies."""
-    if observation.component_names:
-        raise InputError(
-            "detections and limits are of one sky, and this result has "
-            f"{' and '.join(observation.component_names)}: deconvolve images of one filter without "
-            "`components`"
-        )
-
-
 def significance(outcome: Outcome, width: float, false_alarms: float) -> Significance:
     """Return the sources beside the stars of a reconstruction, `lnocl.Result.significance`."""
     check_search(width, false_alarms)
     observation = outcome.observation
-    refuse_components(observation)
     null = null_of(outcome)
     found = ScoreMap(null, width * observation.oversample)
     least = found.threshold(false_alarms)

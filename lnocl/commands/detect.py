@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 SOURCES = (
     parameter(Result.significance, "width", metavar="FWHM"),
     parameter(Result.significance, "false_alarms", metavar="N"),
+    parameter(Result.significance, "images_of", metavar="FILTER"),
 )
 OPTIONS = [
     options.result("the detections and the map of signal-to-noise are added to it"),
@@ -45,7 +46,7 @@ def _run(arguments: argparse.Namespace) -> list[str]:
     found, again = find(arguments, "detections")
     table, unit = in_unit(found.detections, again.frames), again.frames.unit
     parts = {"DETECTIONS": table, "SIGNAL": found.signal_to_noise}
-    add_parts(again.saved, parts, cards(found, unit), unit)
+    add_parts(again.saved, parts, cards(arguments, found, unit), unit)
     view = found.view(signal=found.signal_to_noise)
     return finish(arguments, view, table, "detections", _summary_lines(found, table))
 
@@ -53,7 +54,7 @@ def _run(arguments: argparse.Namespace) -> list[str]:
 def find(arguments: argparse.Namespace, content: str) -> tuple[Significance, RerunOfFile]:
     """Return the significance of sources in a result, and what its run was made of."""
     from lnocl.io import atomic, tables
-    from lnocl.significance import check_search, refuse_components, significance
+    from lnocl.significance import check_search, significance
 
     check_search(arguments.width, arguments.false_alarms)
 
@@ -65,8 +66,7 @@ def find(arguments: argparse.Namespace, content: str) -> tuple[Significance, Rer
 
     check()  # before the result is read; then that nothing that it was made of is replaced
     again = RerunOfFile.read(arguments.result, arguments.quiet, check)
-    refuse_components(again.frames.observation)
-    outcome = again.outcome()
+    outcome = again.outcome().of_filter(arguments.images_of)
     with ignored_notes():
         return significance(outcome, arguments.width, arguments.false_alarms), again
 
@@ -90,13 +90,18 @@ def in_unit(table: QTable, frames: Frames) -> QTable:
     return table
 
 
-def cards(found: Significance, unit: str) -> list[tuple[str, Any, str]]:
+def cards(
+    arguments: argparse.Namespace, found: Significance, unit: str
+) -> list[tuple[str, Any, str]]:
     """Return the header cards that say what was looked for, and the unit of fluxes."""
+    from lnocl.io.parts import ascii_of
+
     return [
         ("SRCWIDTH", found.width, "FWHM of the sources, pixels; 0: points"),
         ("FALSALRM", found.false_alarms, "false alarms expected in the field"),
         ("THRESHOL", found.threshold, "signal-to-noise of detections"),
         ("FLUXUNIT", unit, "unit of fluxes"),
+        *([("IMAGESOF", ascii_of(arguments.images_of), "filter")] if arguments.images_of else []),
     ]
 
 

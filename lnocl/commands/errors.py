@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from lnocl.io.frames import Frames
 
 # Names of quantities of stars and halos; others are of regions and profiles.
-_OF_STARS = re.compile(r"star \d+( epoch \d+)? (flux( in .*)?|x|y)|halo \d+ image \d+")
+_OF_STARS = re.compile(r"star \d+( epoch \d+)? (flux|x|y)( in images of .*)?|halo \d+ image \d+")
 OPTIONS = [
     options.result("errors are added to it; replicas that it has already count"),
     parameter(Result.bootstrap, "n", "--bootstrap"),
@@ -134,7 +134,7 @@ def _add_errors(
 
         n, is_shown = arguments.bootstrap, not arguments.quiet
         found = bootstrap(outcome, n, parts, seed, is_shown, earlier, look, arguments.parallel)
-    return _summarise(found, parts, frames)
+    return _summarise(found, frames)
 
 
 def _replicas_before(arguments: argparse.Namespace) -> Held | None:
@@ -186,7 +186,7 @@ def _write(
         quantities,
         _held(found, frames),
         {
-            "REGIONS": _table_of(_regions(parts), measured),
+            "REGIONS": _table_of(_regions(parts), measured, _n_of_regions(found)),
             "ERROR": found.error_map / frames.electrons,
             "BIAS": found.bias_map / frames.electrons,
             "SHARE": found.share_map,
@@ -204,29 +204,38 @@ def _regions(parts: Sequence[Part]) -> list[Aperture]:
     return [each for each in parts if isinstance(each, Aperture)]
 
 
-def _table_of(regions: Sequence[Aperture], measured: QTable) -> QTable:
-    """Return the regions, which are measured last, as a table: name, area, centre and flux."""
+def _n_of_regions(found: Bootstrap) -> int:
+    """Return how many quantities are of regions, which have one of each component, and ratios."""
+    return sum(each.at is None for each in found.quantities) - len(found.stated)
+
+
+def _table_of(regions: Sequence[Aperture], measured: QTable, n_rows: int) -> QTable:
+    """Return the regions, which are measured last, as a table: name, area, centre and flux.
+
+    Of each region it has a row for each component, and for each ratio.
+    """
     from astropy.table import QTable
 
+    of_regions = measured[len(measured) - n_rows :]
     means = [
         [each.n_pixels, *(np.average(axis, weights=each.weights) for axis in each.places[::-1])]
         for each in regions
     ]
-    columns = [np.array([each.name for each in regions], str), *np.reshape(means, (-1, 3)).T]
+    each = np.repeat(np.reshape(means, (-1, 3)), n_rows // max(len(regions), 1), axis=0)
+    columns = [of_regions["name"], *each.T]
     units = {"x": "pix", "y": "pix"}
     table = QTable(columns, names=("name", "pixels", "x", "y"), units=units)
-    of_regions = measured[len(measured) - len(regions) :]
     table["flux"] = of_regions["value"] - of_regions["bias"]
     for name in ("error", "share", "unit", "note"):
         table[name] = of_regions[name]
     return table
 
 
-def _summarise(found: Bootstrap, parts: Sequence[Part], frames: Frames) -> list[str]:
+def _summarise(found: Bootstrap, frames: Frames) -> list[str]:
     """Return a line a quantity, first those of regions, which were asked for."""
     table = found.to_table(frames.electrons, frames.unit)
     table = table[[each.at is None for each in found.quantities]]  # profiles are to be drawn
-    n_regions = len(_regions(parts))
+    n_regions = _n_of_regions(found)
     table, n_listed = table[np.roll(np.arange(len(table)), n_regions)], max(MAX_LISTED, n_regions)
     without = n_regions and not len(found.of_psfs)
     of_regions = ", of regions without what PSFs have wrong" if without else ""
@@ -242,7 +251,8 @@ def _summarise(found: Bootstrap, parts: Sequence[Part], frames: Frames) -> list[
             note += "; smoothing changes it by as much as the error"
         low, high = (rounded(row[end], row["error"]) for end in ("low95", "high95"))
         value = with_error(row["value"] - row["bias"], row["error"])
-        lines.append(f"{row['name']}: {value} {row['unit']} ({low} to {high}{note})")
+        value = f"{value} {row['unit']}".rstrip()  # a ratio has no unit
+        lines.append(f"{row['name']}: {value} ({low} to {high}{note})")
     if len(table) > n_listed:
         lines.append(f"and {len(table) - n_listed} more in the table ERRORS")
     return lines

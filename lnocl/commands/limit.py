@@ -64,7 +64,7 @@ def _run(arguments: argparse.Namespace) -> list[str]:
     frames = again.frames
     table = detect.in_unit(found.contrast_curves([each / 100 for each in COMPLETENESS]), frames)
     maps = {f"LIMIT{each}": found.limit(each / 100) / frames.electrons for each in COMPLETENESS}
-    cards = detect.cards(found, frames.unit)
+    cards = detect.cards(arguments, found, frames.unit)
     add_parts(again.saved, {"LIMITS": table, **maps}, cards, frames.unit)
     lines = _summary_lines(found, table, maps["LIMIT50"], frames.unit)
     with ignored_notes():

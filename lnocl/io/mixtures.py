@@ -48,8 +48,10 @@ def _weight(files: ImageFiles, name: str, j: int, text: str) -> tuple[float, flo
     """Return the weight of a component in image j, its error, and whether a header has it."""
     value, _, error = text.strip().partition(PLUS_MINUS)
     weight, deviation = _number(value), _number(error or "0")
-    if deviation is None:
-        raise InputError(f"`components` {name!r} has the error {error!r}, which is not a number")
+    if deviation is None or not 0.0 <= deviation < float("inf"):
+        raise InputError(
+            f"`components` {name!r} has the error {error!r}; give a number, zero or more"
+        )
     if weight is not None:
         return weight, deviation, False
     keyword = value.strip().removeprefix(OVER)

@@ -149,8 +149,8 @@ def _region(view: ResultView, region: Region, step: int) -> dict[str, Any]:
     extended = {name: q**2 * block_means(sky.extended[fine], q) for name, sky in skies.items()}
     top = max(map(result.brightest, extended.values()))
     limits = 0.0, top, result.FAINT_SHARE * top
-    for name, sky in extended.items():
-        source = _layer(name, block_means(sky, step), limits, corner, *in_unit)
+    for name, source_light in extended.items():
+        source = _layer(name, block_means(source_light, step), limits, corner, *in_unit)
         if (doubtful := skies[name].doubtful) is not None:
             flags = block_means(doubtful[fine], q * step) >= 0.5
             source["doubtful"] = {"png": _png(flags[::-1].astype(np.uint8))}

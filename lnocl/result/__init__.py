@@ -6,7 +6,7 @@ import os
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from functools import cached_property, reduce
-from itertools import compress
+from itertools import compress, cycle
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -32,8 +32,8 @@ if TYPE_CHECKING:
 
 __all__ = ["Callback", "Estimate", "Iterating", "Result", "make_result", "view_of"]
 
-# Stars that a notebook lists.
-MAX_LISTED = 10
+# Stars that a notebook lists, and skies that it shows.
+MAX_LISTED, MOST_SKIES = 10, 4
 
 HISTORY_DTYPE = np.dtype([("iteration", np.int64), ("objective", np.float64)])
 
@@ -266,7 +266,8 @@ class Result(Measured):
             shows the star. Where positions were refined, also ``x_error`` and ``y_error``, in
             pixels. With several epochs each star has a row in each: rows of one star are its light
             curve. Then ``epoch`` is the number of the epoch, from 0 on, and ``epoch_label`` its
-            label; ``variation_error`` is the error of the flux less the star's mean.
+            label; ``variation_error`` is the error of the flux less the star's mean. With
+            components these rows are of filters, which ``images_of`` names instead of both.
 
         Examples
         --------
@@ -294,9 +295,10 @@ class Result(Measured):
         columns["flux_error"] = self.star_flux_errors * unit
         if (n_epochs := self._observation.n_epochs) > 1:
             columns["epoch"] = np.arange(len(self.star_fluxes)) % n_epochs
-            labels = np.array(self._observation.epoch_labels)
-            columns["epoch_label"] = labels[columns["epoch"]]
-            columns["variation_error"] = self.star_variation_errors * unit
+            labels = np.array(self._observation.epoch_labels)[columns["epoch"]]
+            columns["images_of" if self.component_names else "epoch_label"] = labels
+            if not self.component_names:
+                columns["variation_error"] = self.star_variation_errors * unit
         return QTable(columns)
 
     def plot(self) -> Figure:
@@ -341,7 +343,9 @@ class Result(Measured):
         images. The primary HDU holds the extended source. The tables STARS, HISTORY, PLAN and
         MESSAGES hold the stars, the objectives, the plan, and the lines of ``print(result)``.
         HALOS holds the amounts of halos, and HELDOUT the errors that held-out counts estimate,
-        where there are any. PSFS and others are added where PSFs were refined. Extended source and
+        where there are any. With components the primary HDU is a cube of their skies, COMPONENTS
+        has their names and light, and NOISE the noise of their pixels by counts. PSFS and others
+        are added where PSFs were refined. Extended source and
         stars are in electrons, per second where exposures were given.
 
         The cubes MODELS and RESIDUALS hold `models`, in electrons, and `residuals` of each image.
@@ -429,6 +433,9 @@ class Result(Measured):
         header, wcs = self._wcs_header(), None
         if header is not None:
             wcs = make_wcs(finer_cards(wcs_cards(header), self._observation.oversample))
+            if self.component_names:
+                wcs = wcs.sub([1, 2, 0])  # the last for the planes
+                wcs.array_shape = self.extended.shape
         return CCDData(self.extended, unit=self._unit, wcs=wcs)
 
     def _wcs_header(self) -> fits.Header | None:
@@ -441,9 +448,13 @@ class Result(Measured):
 
     def _repr_html_(self) -> str:
         """Return a table for a notebook, with a thumbnail where matplotlib is there."""
+        labels = [f" in images of {each}" for each in self._observation.epoch_labels]
+        seen = cycle(labels if self.component_names else [""])
         stars = [
-            f"({x:.2f}, {y:.2f}): {flux:.5g}"
-            for (x, y), flux in zip(self.star_positions, self.star_fluxes, strict=True)
+            f"({x:.2f}, {y:.2f}): {flux:.5g}{where}"
+            for (x, y), flux, where in zip(
+                self.star_positions, self.star_fluxes, seen, strict=False
+            )
         ]
         shown = [*stars[:MAX_LISTED], *(["..."] if len(stars) > MAX_LISTED else [])]
         rows = {
@@ -453,8 +464,8 @@ class Result(Measured):
             **dict(self._halo_rows()),
             "device": self.device,
         }
-        first = self.extended if self.extended.ndim == 2 else self.extended[0]
-        return html_card("lnocl.Result", rows, first)
+        skies = self.extended[:MOST_SKIES] if self.component_names else self.extended
+        return html_card("lnocl.Result", rows, skies)
 
     @property
     def _unit(self) -> str:
@@ -482,9 +493,10 @@ class Result(Measured):
 
     def __repr__(self) -> str:
         shape = " x ".join(map(str, self.extended.shape[:-3:-1]))
+        n_stars = len(self.star_positions) // self._observation.n_epochs
         return (
-            f"<lnocl.{type(self).__name__} of {counted(len(self.star_positions), 'star')} and "
-            f"{shape} pixels after {counted(self.n_iter, 'iteration')}>"
+            f"<lnocl.{type(self).__name__} of {counted(n_stars, 'star')} and {shape} pixels after "
+            f"{counted(self.n_iter, 'iteration')}>"
         )
 
     def _light_rows(self) -> dict[str, str]:

@@ -87,20 +87,29 @@ def draw(folder: str, results: Sequence[str], overwrite: bool = False) -> Iterat
         yield save(folder, "objects", draw_beside(beside), overwrite)
 
 
-def read_profiles(path: str) -> list[tuple[str, Table, Table, str]]:
-    """Return name, light, width and unit of light of each profile whose errors a result has."""
-    held = read_parts(path, ["ERRORS"])
-    if not held:
+def read_profiles(path: str) -> list[tuple[str, dict[str, tuple[Table, Table]], str]]:
+    """Return name, light and width, and unit of light of each profile whose errors a result has.
+
+    With components each has light and width, by its name; else there is one without a name.
+    """
+    held = read_parts(path, ["ERRORS", "COMPONENTS"])
+    if "ERRORS" not in held:
         return []
     from astropy.table import Table  # which takes its time to load
 
     errors = Table(held["ERRORS"].values)
     along = errors[np.isfinite(errors["at"])]
     names = list(dict.fromkeys(along["name"].tolist()))
+    pairs = [
+        tuple(along[along["name"] == name] for name in pair)
+        for pair in zip(names[::2], names[1::2], strict=True)
+    ]
+    skies = held["COMPONENTS"].values["name"].tolist() if "COMPONENTS" in held else [""]
     found = []
-    for flux, width in zip(names[::2], names[1::2], strict=True):
-        parts = [along[along["name"] == name] for name in (flux, width)]
-        found.append((flux.removesuffix(" flux"), *parts, parts[0]["unit"][0]))
+    for i in range(0, len(pairs), len(skies)):
+        of_each = dict(zip(skies, pairs[i : i + len(skies)], strict=True))
+        name = names[2 * i].removeprefix(f"{skies[0]} ").removesuffix(" flux")
+        found.append((name, of_each, pairs[i][0]["unit"][0]))
     return found
 
 

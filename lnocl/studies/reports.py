@@ -23,7 +23,7 @@ from lnocl.result.summary import rounded, with_error
 from lnocl.studies.figures import check_saved, view_of
 
 # The tables that are shown, and what those are of whose rows have numbers.
-TABLES = "STARS", "HALOS", "REGIONS", "ERRORS", "DETECTIONS", "LIMITS"
+TABLES = "STARS", "COMPONENTS", "HALOS", "REGIONS", "ERRORS", "DETECTIONS", "LIMITS"
 NUMBERED = {"STARS": "star", "DETECTIONS": "detection"}
 # Cards that say nothing of the result.
 LEFT_OUT = "", "COMMENT", "HISTORY", "SIMPLE", "BITPIX", "EXTEND"
@@ -103,6 +103,8 @@ def table_of(name: str, part: Content, saved: SavedResult) -> Table:
         values = {NUMBERED[name]: numbers // (n_epochs if name == "STARS" else 1) + 1, **values}
     if "epoch" in values and saved.epoch_labels:
         values["epoch"] = np.array(saved.epoch_labels)[values["epoch"].astype(int)]
+    if saved.component_names:
+        values = {"images of" if key == "epoch" else key: each for key, each in values.items()}
     errors = {key: values[f"{key}_error"] for key in values if f"{key}_error" in values}
     if "error" in values:
         errors |= dict.fromkeys(("flux", "value less bias"), values["error"])

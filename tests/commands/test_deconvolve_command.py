@@ -153,8 +153,8 @@ class TestDeconvolve:
         assert "".join(header["HISTORY"]).replace("\\", "") == (
             f"cd {os.getcwd()}lnocl deconvolve a.fits b.fits --psf k1.fits --psf-centre given "
             "--background 2.5 3.0000000000000004 --read-noise 1.0 --star 7.0,5.0 --star 2.0,9.0 "
-            "--n-iter 7 --stop none --solver sgm --mu 0.001 --smoothing 0.02 --pad 3 "
-            "--precision double --engine numpy -o out.fits"
+            "--n-iter 7 --stop none --solver sgm --mu 0.001 --smoothing 0.02 "
+            "--spectral-smoothing 0.0 --pad 3 --precision double --engine numpy -o out.fits"
         )
 
     @pytest.mark.parametrize("n_iter", [1, 30])

@@ -123,7 +123,7 @@ def test_profiles_are_drawn_with_their_errors(capsys):
         assert f"drew figures/result_profile_{k}.png" in said
         assert Path(f"figures/result_profile_{k}.png").exists()
     (flux, width) = [along[along["name"] == f"jet {kind}"] for kind in ("flux", "width")]
-    figure = draw_bands("jet", flux, width, "electron")
+    figure = draw_bands("jet", {"": (flux, width)}, "electron")
     bands = figure.axes[0].collections
     assert [each.get_label() for each in bands] == ["95 %", "68 %"]
     outer = bands[0].get_datalim(figure.axes[0].transData)

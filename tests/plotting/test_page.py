@@ -91,6 +91,27 @@ def test_doubtful_pixels_are_outlined_on_the_page(oversample):
     assert "doubtful" not in data_of(make_report(make_view(p=0), "a"))["regions"][0]["sources"][0]
 
 
+def test_components_and_their_ratio_are_layers_of_one_stretch():
+    extended = np.random.default_rng(4).uniform(1.0, 5.0, (2, 60, 70))
+    noise = np.full(extended.shape, 0.2)
+    noise[1, :20] = 9.0
+    view = make_view(p=1, names=["residuals", "continuum"], extended=extended, noise=noise)
+    for region in data_of(make_report(view, "a"))["regions"]:
+        one, other, ratio = region["sources"]
+        assert [each["name"] for each in region["sources"]] == [
+            *("residuals", "continuum", "residuals / continuum")
+        ]
+        assert (one["high"], one["palette"]) == (other["high"], other["palette"])
+        assert (ratio["unit"], ratio["label"], ratio["scale"]) == ("", "residuals / continuum", 0)
+    there = data_of(make_report(view, "a"))["regions"][0]["sources"]
+    for layer, sky in zip(there, extended, strict=False):
+        assert abs(decoded(layer) - sky).max() < 0.15
+    found = decoded(there[2])
+    assert np.isnan(found[:20]).all()
+    expected = (extended[0] / extended[1])[20:].clip(0.0, there[2]["high"])
+    np.testing.assert_allclose(found[20:], expected, atol=0.01)
+
+
 def test_stars_of_a_turned_image_are_where_it_sees_them():
     turn = np.array([[0.0, -1.0], [1.0, 0.0]])
     view = make_view(p=2, stars=[(40.0, 30.0), (45.0, 33.0)], star_fluxes=np.ones(2),

@@ -105,7 +105,7 @@ BAND = {name: [1.0, 2.0] for name in ("at", "value", "bias", "low68", "high68", 
     "draw",
     [
         lambda: draw_beside({BAD: make_view(p=0)}),
-        lambda: draw_bands(BAD, BAND, BAND, BAD),
+        lambda: draw_bands(BAD, {BAD: (BAND, BAND)}, BAD),
     ],
     ids=["beside", "bands"],
 )

@@ -12,7 +12,9 @@ from lnocl.io.saved_results import read_result
 from lnocl.plotting.light_curves import light_curves
 from lnocl.plotting.result import (
     MAX_SIGMA,
+    MOST_SKIES,
     MOST_STARS,
+    OUTLINED,
     Region,
     draw_result,
     image_limits,
@@ -275,3 +277,71 @@ def test_colour_bars_are_as_high_as_their_panels_and_their_ticks_apart():
         assert (panel.y0, panel.y1) == pytest.approx((beside.y0, beside.y1), abs=1)
         labels = [each.get_window_extent() for each in bar.get_yticklabels() if each.get_text()]
         assert all(low.y1 <= high.y0 for low, high in pairwise(sorted(labels, key=lambda b: b.y0)))
+
+
+def make_skies(k=2, **changes):
+    names = ["line", "continuum", *(f"slice {i}" for i in range(2, k))]
+    extended = np.random.default_rng(4).uniform(1.0, 5.0, (k, 60, 70))
+    extended[0] *= 3.0
+    noise = np.full(extended.shape, 0.2)
+    noise[:, 30:] = np.nan  # not observed
+    given = {"names": names, "extended": extended, "noise": noise}
+    return make_view(p=1, **{**given, **changes})
+
+
+def test_components_are_beside_each_other_on_one_stretch_with_their_ratio():
+    view = make_skies()
+    shown = panels(draw_result(view))
+    assert [title for title, _ in shown] == [
+        *("image, whole frame", "model", "residuals / noise"),
+        *("line, whole frame", "continuum, whole frame"),
+        "line / continuum, whole frame\ngrey: within noise",
+        *("image, star 1", "model", "residuals / noise"),
+        *("line, star 1", "continuum, star 1", "line / continuum, star 1\ngrey: within noise"),
+    ]
+    line, continuum, ratio = (image for _, image in shown[3:6])
+    np.testing.assert_array_equal(line.get_array(), view.extended[0])
+    assert line.norm.vmax == continuum.norm.vmax == view.extended[0].max()
+    found = np.ma.filled(ratio.get_array(), np.nan)
+    np.testing.assert_array_equal(found[:30], view.extended[0, :30] / view.extended[1, :30])
+    assert np.isnan(found[30:]).all()
+
+
+def test_a_ratio_is_blank_where_a_component_is_within_noise():
+    view = make_skies(noise=np.full((2, 60, 70), 1.0))
+    (ratio,) = view.ratios().values()
+    np.testing.assert_array_equal(np.isfinite(ratio), (view.extended > 3.0).all(axis=0))
+    assert not make_skies(names=["J", "K"]).ratios()
+    assert not make_skies(noise=None).ratios()
+
+
+def test_a_ratio_that_is_nowhere_known_is_drawn():
+    view = make_skies(noise=np.full((2, 60, 70), np.nan))
+    ratios = [image for title, image in panels(draw_result(view)) if title.startswith("line / ")]
+    assert [np.isfinite(np.ma.filled(each.get_array(), np.nan)).any() for each in ratios] == [
+        False,
+        False,
+    ]
+
+
+def test_of_many_components_the_first_are_shown():
+    figure = draw_result(make_skies(20))
+    skies = [title for title, _ in panels(figure) if title.endswith(", whole frame")][1:]
+    assert len(skies) == MOST_SKIES
+    assert skies[-1] == "slice 8, whole frame"
+    (said,) = (part.get_suptitle() for part in figure.subfigs if part.get_suptitle())
+    assert said == "the first 9 of 39 components and ratios"
+
+
+def test_without_images_components_have_their_row():
+    view = make_skies(images=np.zeros((0, 60, 70)), stars=[], star_fluxes=np.zeros(0))
+    assert [title.partition("\n")[0] for title, _ in panels(draw_result(view))] == [
+        *("line, whole frame", "continuum, whole frame", "line / continuum, whole frame")
+    ]
+
+
+def test_doubtful_pixels_are_those_of_each_component():
+    doubtful = np.zeros((2, 60, 70), bool)
+    doubtful[1, 10:20, 10:20] = True
+    shown = panels(draw_result(make_skies(doubtful=doubtful)))
+    assert [OUTLINED in title for title, _ in shown[3:5]] == [False, True]

@@ -4,6 +4,8 @@ from functools import cache
 
 import numpy as np
 import pytest
+from astropy.nddata import CCDData
+from astropy.wcs import WCS
 from scenes import paper
 
 import lnocl
@@ -97,6 +99,29 @@ def test_what_is_printed_names_components_and_filters():
     assert "nan" not in str(result())
 
 
+def test_tables_cards_and_cubes_have_each_component():
+    found = result()
+    assert repr(found).startswith("<lnocl.Result of 1 star and 32 x 16 pixels after ")
+    table = found.to_table()
+    assert table["images_of"].tolist() == ["line + continuum", "continuum"]
+    assert not {"epoch_label", "variation_error"} & {*table.colnames}
+    assert Scene(observe(), table).n_stars == 2  # one in two filters
+    card = found._repr_html_()
+    assert "in images of line + continuum<br>" in card
+    assert "<th style='text-align:left'>continuum</th>" in card
+    assert found.doubtful.shape == found.extended.shape
+
+
+def test_a_cube_has_the_coordinates_of_its_planes():
+    wcs = WCS({"CTYPE1": "RA---TAN", "CTYPE2": "DEC--TAN", "CRVAL1": 65.0, "CRVAL2": 19.5})
+    images = [CCDData(each, unit="electron", wcs=wcs) for each in models()]
+    observation = lnocl.Observation(images, psfs_of(2), background=10.0, components=WEIGHTS)
+    cube = lnocl.deconvolve(observation, **{**FIXED, "n_iter": 2, "smoothing": 0.0}).to_ccddata()
+    assert cube.shape == (2, *SHAPE)
+    assert cube.wcs.celestial.wcs.crval.tolist() == [65.0, 19.5]
+    assert cube[:1].shape == (1, *SHAPE)
+
+
 def test_the_order_of_components_does_not_matter():
     turned = {"continuum": WEIGHTS["continuum"], "line": WEIGHTS["line"]}
     options = {**FIXED, "smoothing": 0.01, "pad": 0}
@@ -161,8 +186,8 @@ def test_replicas_measure_each_component_and_how_bright_it_is_over_the_continuum
     found = result().bootstrap(10, regions=regions)
     names = [each.name for each in found.quantities]
     assert names == [
-        "star 1 flux in line + continuum",
-        "star 1 flux in continuum",
+        "star 1 flux in images of line + continuum",
+        "star 1 flux in images of continuum",
         "line region 1",
         "continuum region 1",
         "line / continuum region 1",
@@ -174,6 +199,9 @@ def test_replicas_measure_each_component_and_how_bright_it_is_over_the_continuum
     assert values[4] == pytest.approx(values[2] / values[3])
     assert (errors > 0).all()
     assert found.error_map.shape == (2, *SHAPE)
+    # What the star may have more or less of, both components have: so has their ratio.
+    of_star = found.shares[2] - values[4] * found.shares[3]
+    np.testing.assert_allclose(found.shares[4], of_star / values[3])
     truth = regions[0].to_mask("exact").multiply(LINE).sum()
     assert abs(values[2] - truth) < 3 * errors[2]
 
@@ -281,7 +309,7 @@ def test_a_point_is_found_in_the_images_of_a_filter():
     assert np.hypot(points["x"][0].value - 12, points["y"][0].value - 32) < 0.3
     assert points["flux"][0].value == pytest.approx(600.0, abs=4 * points["flux_error"][0].value)
     assert len(found.significance(images_of="continuum").detections) == 0
-    with pytest.raises(InputError, match="give 'line \\+ continuum' or 'continuum'"):
+    with pytest.raises(InputError, match="give images_of as 'line \\+ continuum' or 'continuum'"):
         found.significance()
 
 

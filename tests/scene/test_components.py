@@ -87,6 +87,8 @@ def test_stars_have_a_flux_in_each_filter_of_each_epoch():
         ({"line": [1, 0], "continuum": [1, 0]}, "shows no component"),
         ({"line": [1, -1], "continuum": [1, 1]}, "negative"),
         ({"line": [1, 0, 1], "continuum": [1, 1, 1]}, "a number for each of the 2 images"),
+        ({"": [1, 0], "continuum": [1, 1]}, "a name that is empty, or there twice"),
+        ({1: [1, 0], "1": [1, 1]}, "a name that is empty, or there twice"),
         ({"line": [1, 1]}, "components has 1 name"),
     ],
 )

@@ -635,6 +635,21 @@ WRONG = {
         [np.eye(2, 3), 2.0 * np.eye(2, 3)],
         [np.eye(2, 3), 0.5 * np.eye(2, 3)],
     ],
+    "components": [
+        {"line": [1, 0, 0], "continuum": [1, 1, 1]},
+        {"line": [1, 0], "continuum": [1, -1]},
+        {"line": [1, 0], "continuum": [1, np.nan]},
+        {"line": [1, 0], "continuum": [2, 0]},
+        {"line": [1, 1], "continuum": [1, 1]},
+        {"line": [1, 0], "continuum": [0, 0]},
+        {"line": [1, 0], "continuum": "all"},
+        {"line": [1, 0], "": [1, 1]},
+        {"line": [1, 0], "continuum": [1, 1], "scattered": [0, 1]},
+        {"line": [1, 1]},
+        {},
+        [[1, 0], [1, 1]],
+    ],
+    "component_errors": [{"line": 0.1}, [[0.1, 0.1]], 0.1, "all"],
     "epochs": [[0], [0, 1, 2], [None, "a"], [0.0, np.nan], "ab", [[1], [2, 3]]],
     "halos": [np.ones((8, 8)), -np.ones((8, 9)), np.zeros((8, 9)), np.full((8, 9), np.nan)],
     "transmission": [
@@ -665,6 +680,24 @@ def error_of(make, **changes):
     return str(caught.value)
 
 
+WRONG_BESIDE_COMPONENTS = [
+    {"lines": 0.1},
+    {"line": -0.1},
+    {"line": [0.1, np.nan]},
+    {"line": [0.1, 0.1, 0.1]},
+    np.zeros((2, 3)),
+    np.full((2, 2), np.inf),
+]
+
+
+@pytest.mark.parametrize("errors", WRONG_BESIDE_COMPONENTS, ids=str)
+def test_errors_of_weights_are_refused_alike(errors):
+    given = {"images": np.full((2, 8, 9), 5.0), "psfs": np.ones((3, 3))}
+    given["components"] = {"line": [1, 0], "continuum": [1, 1]}
+    wrong = error_of(lnocl.Observation, **given, component_errors=errors)
+    assert error_of(lnocl.Observation(**given).replace, component_errors=errors) == wrong
+
+
 @pytest.mark.parametrize("name", WRONG)
 def test_replace_gives_the_same_errors_as_a_new_observation(name):
     given = {"images": np.full((2, 8, 9), 5.0), "psfs": np.ones((3, 3)), "background": [1.0, 2.0]}
@@ -684,12 +717,15 @@ def test_every_parameter_is_a_row_of_the_table_of_fields():
     assert {*FIELDS, *MOVES} == names - {"psf_centre"}
 
 
+LINE_AND_CONTINUUM = {"line": [1, 0], "continuum": [1, 1]}
 RIGHT = {
     "mask": MASK_89,
     "background": np.where(MASK_89, 0.0, 3.0),
     "exposure": [1.0, 1.5] * u.min,
     "offsets": [(0.0, 0.0), (1.5, -2.0)],
     "transforms": TURNED,
+    "components": LINE_AND_CONTINUUM,
+    "component_errors": {"continuum": [0.1, 0.0]},
     "epochs": ["second", "first"],
     "halos": HALO_89,
     "oversample": 2,
@@ -716,9 +752,14 @@ def test_replace_equals_a_new_observation(name, before):
     given = {"images": np.full((2, 8, 9), 5.0), "psfs": np.ones((2, 3, 3))}
     if before:
         given[before] = RIGHT[before]
+    if before == "component_errors":
+        given["components"] = LINE_AND_CONTINUUM
     other = made(lnocl.Observation(**given).replace, **{name: RIGHT[name]})
     if name == "transforms":  # which take the place of offsets
         given.pop("offsets", None)
+    if name == "components":  # which bring theirs
+        given.pop("epochs", None)
+        given.pop("component_errors", None)
     new = made(lnocl.Observation, **{**given, name: RIGHT[name]})
     assert other.keys() == new.keys()
     for attribute, expected in new.items():

@@ -281,8 +281,11 @@ class Outcome:
             return self
         names = observation.filter_names
         if mixing is None or label not in names:
-            known = " or ".join(map(repr, names)) or "None, as there is one sky"
-            raise InputError(f"`images_of` is {label!r}; give {known}")
+            if not names:
+                raise InputError("this result is of one sky: leave `images_of` out")
+            what = "sources are of one" if label is None else f"{label!r} is no"
+            known = " or ".join(map(repr, names))
+            raise InputError(f"{what} filter of this result: give `images_of` as {known}")
         g = names.index(label)
         part, row, penalty = self.estimate.parts[g], mixing.rows[g], self.scene.penalty
         shares = np.array(penalty.shares or [1.0] * len(row))

@@ -94,25 +94,25 @@ def quantities_of(
 
     The shares have a row for each quantity, and a column for each flux and position of those.
     """
-    scene, observation = outcome.scene, outcome.scene.observation
-    n_epochs, images = observation.n_epochs, range(scene.n_images)
-    if observation.component_names:
-        where = [("", f" in {label}") for label in observation.epoch_labels]
-    else:
-        where = [(f" epoch {e}", "") for e in range(n_epochs)] if n_epochs > 1 else [("", "")]
+    scene = outcome.scene
+    n_epochs, images = scene.observation.n_epochs, range(scene.n_images)
+    names = scene.observation.component_names
+    stars = [f" epoch {e} {{}}" for e in range(n_epochs)] if n_epochs > 1 else [" {}"]
+    if names:
+        stars = [f" {{}} in images of {each}" for each in scene.observation.epoch_labels]
     shown = np.flatnonzero(scene.is_shown[: scene.n_stars]).tolist()
-    pairs = ((s // n_epochs + 1, *where[s % n_epochs]) for s in shown)
-    labels = [Label(f"star {k}{epoch} flux{of_filter}", FLUX) for k, epoch, of_filter in pairs]
-    halos = range(len(observation.halos))
+    called = [f"star {s // n_epochs + 1}{stars[s % n_epochs]}" for s in shown]
+    labels = [Label(each.replace("{}", "flux"), FLUX) for each in called]
+    halos = range(len(scene.observation.halos))
     labels += [Label(f"halo {k + 1} image {j + 1}", AMOUNT) for k in halos for j in images]
     if outcome.moves:
-        labels += [Label(f"star {s + 1} {axis}", LENGTH) for s in shown for axis in "xy"]
+        labels += [Label(each.replace("{}", axis), LENGTH) for each in called for axis in "xy"]
     n_stated = len(labels)
     notes, shares = [""] * n_stated, [*np.eye(n_stated)]
     if parts:
         observed = _observed(scene)
         cutouts = [[scene.psf_on_sky(j, s) for j in images] for s in shown]
-    names = observation.component_names
+    ratios = list[tuple[int, int, int]]()
     for part in parts:
         own, slices = part.labels(), part.slices if isinstance(part, Profile) else [part]
         held = np.zeros((len(own), n_stated))  # widths hold no light
@@ -127,12 +127,16 @@ def quantities_of(
             labels, notes = labels + named, notes + own_notes
             filled = np.append(of_filters, np.zeros(n_stated - len(shown)))
             shares = [*shares, *(held * filled)]
+        first = len(labels) - len(names)
         for k, m in _compared(part, names):
+            ratios.append((len(labels), first + k, first + m))
             labels = [*labels, Label(f"{names[k]} / {names[m]} {part.name}", RATIO)]
             notes, shares = notes + own_notes[:1], [*shares, np.zeros(n_stated)]
     light = outcome.light().sky() if parts else outcome.sky
     sky = Sky(outcome.estimate.observed_sky, light, outcome.star_fluxes, scene.stars)
     values = measure(outcome, sky, parts).tolist()
+    for ratio, k, m in ratios:  # what a star's light in both changes
+        shares[ratio] = (shares[k] - values[ratio] * shares[m]) / (values[m] or np.nan)
     quantities = tuple(
         Quantity(label.name, label.kind, value, note, label.at)
         for label, value, note in zip(labels, values, notes, strict=True)

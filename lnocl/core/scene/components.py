@@ -90,7 +90,7 @@ def read_components(field: Field, value: Any, held: Observation) -> Array:
         held.component_names = tuple(map(str, value))
     else:
         weights = numbers(field.name, value)
-    if weights.shape != (n_images, len(held.component_names)):
+    if weights.shape != (n_images, len(getattr(held, "component_names", ()))):
         raise InputError(
             f"`{field.name}` must be names with a weight for each of the {n_images} images, such "
             "as {'line': [1, 0], 'continuum': [1, 1]}"
@@ -163,6 +163,8 @@ def _refuse_unclear(weights: Array, names: Sequence[str]) -> None:
         raise InputError(
             f"`components` has {counted(len(names), 'name')}; give 2 to {MOST}, or leave it out"
         )
+    if len({*names} - {""}) < len(names):
+        raise InputError("`components` has a name that is empty, or there twice; give each its own")
     if dark := [name for name, each in zip(names, weights.T, strict=True) if not each.any()]:
         raise InputError(f"no image shows the component {dark[0]!r}: its weights are all 0")
     if blind := np.flatnonzero(~weights.any(axis=1)).tolist():

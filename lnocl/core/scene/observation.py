@@ -570,7 +570,8 @@ class Observation:
         **changes : array_like, int, bool or None
             Values by the name of a parameter of `Observation`; any but `psf_centre`. Images and
             PSFs in arrays of float64 are not copied, so leave them as they are. None stands for the
-            default. New `pupils` bring their own `ideal_psfs`.
+            default. New `pupils` bring their own `ideal_psfs`, and new `components` their own
+            `component_errors` and `epochs`.
 
         Returns
         -------

@@ -95,7 +95,8 @@ def spelled(names: Iterable[str], *wanted: str) -> list[str] | None:
 
 def once_each(rows: Any) -> Any:
     """Return a table with each star once: those of lnocl have a row for each of several epochs."""
-    return rows[rows["epoch"] == 0] if {"epoch", "variation_error"} <= {*rows.colnames} else rows
+    is_own = {"variation_error", "images_of", "core_rms"} & {*rows.colnames}
+    return rows[rows["epoch"] == 0] if is_own and "epoch" in rows.colnames else rows
 
 
 def in_pixels(table: Any, columns: Columns, name: str) -> Array:
