@@ -85,7 +85,7 @@ def test_stars_have_a_flux_in_each_filter_of_each_epoch():
         ({"line": [1, 1], "continuum": [1, 1]}, "do not tell line and continuum apart"),
         ({"line": [1, 0], "continuum": [0, 0]}, "no image shows the component 'continuum'"),
         ({"line": [1, 0], "continuum": [1, 0]}, "shows no component"),
-        ({"line": [1, -1], "continuum": [1, 1]}, "negative"),
+        ({"line": [1, -1], "continuum": [1, 1]}, "must be 0, or from 1e-06"),
         ({"line": [1, 0, 1], "continuum": [1, 1, 1]}, "a number for each of the 2 images"),
         ({"": [1, 0], "continuum": [1, 1]}, "a name that is empty, or there twice"),
         ({1: [1, 0], "1": [1, 1]}, "a name that is empty, or there twice"),

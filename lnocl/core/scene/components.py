@@ -26,6 +26,8 @@ if TYPE_CHECKING:
 
 # The component that the light of others is compared with.
 CONTINUUM = "continuum"
+# The largest weight, and the inverse of the least: others would leave the range of float32.
+LARGEST = 1e6
 # The most components, such as slices of a cube.
 MOST = 64
 # The least singular value of the weights, over the largest, that tells components apart.
@@ -95,7 +97,10 @@ def read_components(field: Field, value: Any, held: Observation) -> Array:
             f"`{field.name}` must be names with a weight for each of the {n_images} images, such "
             "as {'line': [1, 0], 'continuum': [1, 1]}"
         )
-    refuse_unless(f"`{field.name}`", weights, "finite and not negative", weights >= 0)
+    in_range = (weights == 0) | ((weights >= 1.0 / LARGEST) & (weights <= LARGEST))
+    refuse_unless(
+        f"`{field.name}`", weights, f"0, or from {1 / LARGEST:g} to {LARGEST:g}", in_range
+    )
     _refuse_unclear(weights, held.component_names)
     return weights
 

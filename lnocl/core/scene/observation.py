@@ -125,9 +125,9 @@ class Observation:
     components : mapping of str to array_like, shape (p,), optional
         Skies of which each image shows a known mixture, by their names, with the weight that each
         has in each image: ``{"line": [1, 0], "continuum": [1, 1]}`` for an image in a line and one
-        beside it. Weights are zero or more, and tell the 2 to 64 components apart. The extended
-        source is a sky for each component, in electrons per pixel of an image of weight 1. Stars
-        have a flux in each filter, that is in images of equal weights.
+        beside it. Weights are 0, or from 1e-6 to 1e6, and tell the 2 to 64 components apart. The
+        extended source is a sky for each component, in electrons per pixel of an image of weight 1.
+        Stars have a flux in each filter, that is in images of equal weights.
     component_errors : mapping of str to array_like, shape (p,), optional
         Standard errors of these weights, by name; 0 where none is given. They are in the errors of
         the light of components.
@@ -251,7 +251,7 @@ class Observation:
         - A halo is 0 on all good pixels of an image.
         - `transmission` is not of the sky's shape, out of range, or 0 everywhere in the images that
           have good pixels.
-        - Weights of `components` are negative or not finite, or do not tell these apart.
+        - Weights of `components` are out of range, or do not tell these apart.
         - A label of `epochs` is missing or not a number, or the labels have no order.
         - `transforms` are given beside `offsets`, or shear the images by more than 0.05 pixels.
         - Pixels of an image are smaller than those of the sky, by its transform.
