@@ -91,12 +91,14 @@ def observe(images, psfs, wrong, **known):
 
 
 def one(images, psfs, on, star, wrong):
+    """Return the result of line and continuum in one fit."""
     weights = {"line": on.astype(float), "continuum": np.ones(len(on))}
     observation = observe(images, psfs, wrong, components=weights)
     return lnocl.deconvolve(observation, [star])
 
 
 def after(images, psfs, on, star, wrong):
+    """Return the line of skies that are subtracted."""
     skies = [
         lnocl.deconvolve(observe(images[of], psfs[of], wrong), [star]).extended for of in (on, ~on)
     ]
@@ -104,6 +106,7 @@ def after(images, psfs, on, star, wrong):
 
 
 def before(images, psfs, on, star, wrong):
+    """Return the line of images that are subtracted."""
     # Off images are as deep, so that the star leaves by a factor of 1. What is added makes the
     # variance of the difference that of counts.
     pairs = zip(images[on], images[~on], strict=True)
@@ -117,13 +120,14 @@ def before(images, psfs, on, star, wrong):
 
 
 def knots(star):
+    """Return the regions of the knots."""
     return [CirclePixelRegion(PixCoord(star[0], star[1] + d), r) for d, r in KNOTS]
 
 
 def pulls(result, star, line, n):
     """Return the errors of the light of the knots over those told."""
     found = result.bootstrap(n, regions=knots(star)).to_table()
-    rows = [row for row in found if row["name"].startswith("line ")]
+    rows = [row for row in found if row["name"].startswith("line region")]
     told = np.array([(row["value"] - row["bias"], row["error"]) for row in rows], float)
     truth = [
         float((each.to_mask("exact").to_image(line.shape) * line).sum()) for each in knots(star)
@@ -132,6 +136,7 @@ def pulls(result, star, line, n):
 
 
 def main():
+    """Print a line for each contrast, number of images and error of the PSFs."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--contrasts", type=float, nargs="+", default=[1, 10, 100, 1000])
     parser.add_argument("--images", type=int, nargs="+", default=[2, 4])

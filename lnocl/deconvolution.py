@@ -36,6 +36,7 @@ def deconvolve(
     *,
     mu: float = 0.0,
     smoothing: float | Literal["auto"] = "auto",
+    spectral_smoothing: float = 0.0,
     solver: SolverName = "sgp",
     n_iter: int = 1000,
     stop: StopName | float | None = "held-out",
@@ -101,6 +102,9 @@ def deconvolve(
         pixels. With held-out counts it is 0, or 1, 3 or 10 times that, whichever they choose
         (:doc:`/validation/sgp`). Where PSFs do not fit the stars it is 3 times that. It is more
         near the stars, as far as rings round these show an error of the PSFs. See Notes.
+    spectral_smoothing : float, optional
+        Weight of that term between each component and the next, such as the slices of a cube, in
+        units of `smoothing`, zero or more. By default components share no prior.
     solver : {"sgp", "sgm"}, optional
         Iteration to use: "sgp", the scaled gradient projection method; or "sgm", the split-gradient
         method, the paper's, which needs ten times the iterations and more.
@@ -383,6 +387,7 @@ def deconvolve(
         prepared.setup,
         mu=mu,
         smoothing=smoothing,
+        spectral_smoothing=spectral_smoothing,
         n_iter=plan.n_iter,
         stop=prepared.stop,
     )

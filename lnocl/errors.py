@@ -10,7 +10,9 @@ import os
 import re
 import sys
 import warnings
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -18,6 +20,33 @@ from typing import Any
 PACKAGE = str(Path(__file__).parent) + os.sep
 NAMED = re.compile(r"`([\w ]+?)(?:\[(\d+)\])?`")
 LOG = logging.getLogger("lnocl")
+
+
+# Images that messages are of, by their numbers among all, and what these show.
+_PART: ContextVar[tuple[Sequence[int], str] | None] = ContextVar("part", default=None)
+
+
+@contextmanager
+def of_images(which: Sequence[int], name: str) -> Iterator[None]:
+    """Have messages count images among all of which these are some, and name what these show."""
+    token = _PART.set((which, name))
+    try:
+        yield
+    finally:
+        _PART.reset(token)
+
+
+def _among_all(message: str) -> str:
+    """Return a message of `of_images` with the numbers of images among all."""
+    if (part := _PART.get()) is None:
+        return message
+    which, name = part
+
+    def replace(found: re.Match[str]) -> str:
+        parameter, index = found.groups()
+        return f"`{parameter}[{which[int(index)]}]`" if index else found[0]
+
+    return f"{name}: {NAMED.sub(replace, message)}"
 
 
 def with_names(message: str, named: Callable[[str], str] = str, first: int = 0) -> str:
@@ -265,7 +294,7 @@ def warn(message: str, category: type[LnoclWarning] = LnoclWarning) -> None:
     level, frame = 2, sys._getframe(1)
     while frame.f_back is not None and frame.f_code.co_filename.startswith(PACKAGE):
         level, frame = level + 1, frame.f_back
-    warnings.warn(category(message), stacklevel=level)
+    warnings.warn(category(_among_all(message)), stacklevel=level)
 
 
 def note(message: str, *values: Any) -> None:
@@ -279,5 +308,5 @@ def detail(message: str, *values: Any) -> None:
 
 
 def _log(level: int, message: str, values: tuple[Any, ...]) -> None:
-    whole = message % values if values else message
+    whole = _among_all(message % values if values else message)
     LOG.log(level, "%s", with_names(whole), extra={"named": whole})

@@ -163,6 +163,7 @@ OPTIONS = {
         parameter(deconvolve, "solver", card=("SOLVER", "iteration")),
         parameter(deconvolve, "mu", metavar="MU"),
         parameter(deconvolve, "smoothing", metavar="WEIGHT"),
+        parameter(deconvolve, "spectral_smoothing", metavar="SHARE"),
         parameter(deconvolve, "pad", card=("PAD", "least unobserved pixels round the images")),
         parameter(deconvolve, "precision", card=("PRECISIO", "precision of the arithmetic")),
         DEVICE,

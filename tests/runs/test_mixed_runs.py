@@ -308,3 +308,29 @@ def test_a_point_is_found_in_the_images_of_a_filter():
     assert len(found.significance(images_of="continuum").detections) == 0
     with pytest.raises(InputError, match="give images_of as 'line \\+ continuum' or 'continuum'"):
         found.significance()
+
+
+def test_messages_of_a_filter_count_images_among_all_and_name_it(log):
+    from lnocl.errors import note, of_images
+
+    with of_images([1, 3], "continuum"):
+        note("`images[1]` and `psfs[0]`, by `n_iter`")
+    note("`images[1]`")
+    assert log.messages == ["continuum: image 3 and psf 1, by n_iter", "image 1"]
+
+
+def test_refinements_of_filters_are_joined_image_by_image():
+    from lnocl.core.runs.outcome import PsfRefinement, joined_refinement
+
+    def refinement(names, values, error):
+        rest = np.zeros(2), np.zeros(1), np.full((3, 4), error)
+        return PsfRefinement(names, np.array(values), (2.0, 1.0), True, error, *rest)
+
+    first = refinement(("shift x", "jitter xx"), [[1.0, 2.0], [3.0, 4.0]], 0.1)
+    second = refinement(("jitter xx",), [[5.0]], 0.2)
+    found = joined_refinement([[0, 2], [1], [3]], [first, second, None], 2)
+    assert found.parameters == ("shift x", "jitter xx")
+    assert found.values.tolist() == [[1.0, 2.0], [0.0, 5.0], [3.0, 4.0], [0.0, 0.0]]
+    assert found.psf_error == 0.2
+    assert found.may_be_faked.shape == (2, 3, 4)
+    assert joined_refinement([[0], [1]], [None, None], 2) is None

@@ -94,14 +94,29 @@ class PsfRefinement:
     hidden_error: float = 0.0
 
 
-def worst(refinements: Sequence[PsfRefinement], n_skies: int) -> PsfRefinement:
-    """Return the refinement of the filter whose PSFs have the largest error, for several skies."""
-    found = max(refinements, key=lambda each: each.psf_error)
+def joined_refinement(
+    images: Sequence[Sequence[int]], found: Sequence[PsfRefinement | None], n_skies: int
+) -> PsfRefinement | None:
+    """Return the refinement of all images from those of filters, as far as there are any.
+
+    Misfit, errors and what these may fake are those of the filter with the largest error.
+    """
+    pairs = [(which, each) for which, each in zip(images, found, strict=True) if each is not None]
+    if not pairs:
+        return None
+    _, most = max(pairs, key=lambda pair: pair[1].psf_error)
+    names = tuple(dict.fromkeys(name for _, each in pairs for name in each.parameters))
+    values = np.zeros((sum(map(len, images)), len(names)))
+    for which, each in pairs:
+        columns = [names.index(name) for name in each.parameters]
+        values[np.array(which)[:, None], columns] = each.values
     return replace(
-        found,
-        is_accepted=any(each.is_accepted for each in refinements),
-        may_be_faked=np.broadcast_to(found.may_be_faked, (n_skies, *found.may_be_faked.shape)),
-        hidden_error=max(each.hidden_error for each in refinements),
+        most,
+        parameters=names,
+        values=values,
+        is_accepted=any(each.is_accepted for _, each in pairs),
+        may_be_faked=np.broadcast_to(most.may_be_faked, (n_skies, *most.may_be_faked.shape)),
+        hidden_error=max(each.hidden_error for _, each in pairs),
     )
 
 

@@ -102,6 +102,8 @@ class Plan:
         Weight of the Tikhonov term.
     smoothing : float or "auto"
         Weight of the edge-preserving term.
+    spectral_smoothing : float
+        Its share between one component and the next.
     n_iter : int
         Iterations at most.
     stop : {"held-out", "discrepancy"}, float or None
@@ -154,6 +156,7 @@ class Plan:
     moves: bool | Literal["auto"] = False
     in_tiles: bool = False
     mends: bool = True
+    spectral_smoothing: float = 0.0
     found: Mapping[str, str] = field(default_factory=dict)
 
     def why_not(self, step: str) -> str:
@@ -220,6 +223,7 @@ def plan(
     *,
     mu: float = 0.0,
     smoothing: float | Literal["auto"] = "auto",
+    spectral_smoothing: float = 0.0,
     solver: SolverName = "sgp",
     n_iter: int = 1000,
     stop: StopName | float | None = "held-out",
@@ -239,8 +243,8 @@ def plan(
     ----------
     observation, stars
         As for `lnocl.deconvolve`.
-    mu, smoothing, solver, n_iter, stop, precision, engine, device, pad, initial_extended, \
-    initial_star_fluxes, refine_positions, refine_psfs, mend_images
+    mu, smoothing, spectral_smoothing, solver, n_iter, stop, precision, engine, device, pad, \
+    initial_extended, initial_star_fluxes, refine_positions, refine_psfs, mend_images
         As for `lnocl.deconvolve`.
 
     Returns
@@ -275,9 +279,14 @@ def plan(
     observation = observation.upright()
     initial = options.read_start(observation, fits_stars, initial_extended, initial_star_fluxes)
     smoothing = options.read_smoothing(smoothing)
-    Penalty(mu, 0.0 if isinstance(smoothing, str) else smoothing)  # refuses what is out of range
+    # Which refuses what is out of range.
+    Penalty(mu, 0.0 if isinstance(smoothing, str) else smoothing, spectral=spectral_smoothing)
+    if spectral_smoothing and not observation.component_names:
+        raise InputError("`spectral_smoothing` is between components, and the images have none")
     setup = Setup(observation, positions, pad, solver, precision, engine, device, False, *initial)
-    made = Plan(setup, mu, smoothing, int(n_iter), stop, mends=flag("mend_images", mend_images))
+    mends = flag("mend_images", mend_images)
+    how: dict[str, Any] = {"mends": mends, "spectral_smoothing": spectral_smoothing}
+    made = Plan(setup, mu, smoothing, int(n_iter), stop, **how)
     is_auto = AUTO.holds(made) and made.does(PSFS)
     showing = positions[owned(observation, positions) < 0]
     families = options.check_families(refine_psfs, observation, showing, refine_positions, is_auto)

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
 from lnocl.core.runs.options import StopName
-from lnocl.core.runs.outcome import Mended, PsfRefinement, worst
+from lnocl.core.runs.outcome import Mended, PsfRefinement, joined_refinement
 from lnocl.core.runs.plan import AUTO, CORES, EXPOSURES, LEVELS, PLACES, PSFS, RAYS, Plan
 from lnocl.core.runs.start import Setup
 from lnocl.core.runs.steady import STEADY, steady_penalty
@@ -18,11 +18,14 @@ from lnocl.core.scene.arrays import Array
 from lnocl.core.scene.components import Mixing
 from lnocl.core.scene.observation import Observation
 from lnocl.core.scene.penalty import Penalty, recommend_smoothing, shares_of_skies
-from lnocl.errors import NotFiniteError, detail
+from lnocl.errors import NotFiniteError, detail, note, of_images
+from lnocl.process import ignored_notes
 from lnocl.progress import Progress
 
 # Of the smoothing that is recommended, from which held-out counts choose besides none.
 MULTIPLES = (1.0, 3.0, 10.0)
+# Filters of which each has lines of its own.
+MOST_TOLD = 4
 # Runs with wrong PSFs end where the objective falls by less than this share of itself.
 CONVERGED = 1e-6
 
@@ -105,13 +108,17 @@ def _mended(plan: Plan, setup: Setup, progress: bool) -> Mended:
         return _judge_psfs(plan, setup, progress) if plan.does(PSFS) else Mended(setup)
     found, mixing = list[Mended](), observation.mixing
     images = [mixing.images_of(g) for g in range(len(mixing.rows))]
-    for which in images:
+    for g, which in enumerate(images):
         own = replace(setup, observation=observation.of_images(which), initial_extended=None)
         own = replace(own, initial_star_fluxes=None)
         families = plan.families
         if len(which) == 1 and not plan.is_asked:  # whose place is that of its stars
             families = tuple(name for name in families if name != "shift")
-        found.append(_mended(replace(plan, setup=own, families=families), own, progress))
+        quiet = ignored_notes() if g >= MOST_TOLD else nullcontext()
+        with of_images(which, observation.filter_names[g]), quiet:
+            found.append(_mended(replace(plan, setup=own, families=families), own, progress))
+    if len(images) > MOST_TOLD:
+        note(f"what was found for {len(images) - MOST_TOLD} other filters is in the result alone")
     return _joined(setup, mixing, images, found)
 
 
@@ -131,10 +138,9 @@ def _joined(
     if any(each is not None for each in near):
         squares = [np.zeros(shape) if each is None else each**2 for each in near]
         near_stars = np.sqrt(np.einsum("gk,gyx->kyx", mixing.rows**2, np.array(squares)))
-    refinements = [each.refinement for each in found if each.refinement is not None]
     return Mended(
         replace(setup, observation=observation, refine_positions=moves),
-        worst(refinements, setup.observation.n_skies) if refinements else None,
+        joined_refinement(images, [each.refinement for each in found], observation.n_skies),
         near_stars,
         all(each.fits for each in found),
         all(each.is_within for each in found),
@@ -185,7 +191,7 @@ def _judge_psfs(plan: Plan, setup: Setup, progress: bool) -> Mended:
 def _penalties(plan: Plan, mended: Mended, are_psfs_wrong: bool) -> list[Penalty]:
     """Return the penalty, or those from which held-out counts choose."""
     if not isinstance(plan.smoothing, str):
-        return [Penalty(plan.mu, plan.smoothing)]
+        return [Penalty(plan.mu, plan.smoothing, spectral=plan.spectral_smoothing)]
     observation = mended.setup.observation
     recommended, shares = recommend_smoothing(observation), shares_of_skies(observation)
     multiples: Sequence[float] = (1.0,)
@@ -195,8 +201,8 @@ def _penalties(plan: Plan, mended: Mended, are_psfs_wrong: bool) -> list[Penalty
     elif plan.stop == "held-out":
         multiples, reason = (0.0, *MULTIPLES), ""
     weights = (each * recommended for each in multiples)
-    near = mended.near_stars
-    penalties = [Penalty(plan.mu, each, near_stars=near, shares=shares) for each in weights]
+    first = Penalty(plan.mu, 0.0, None, mended.near_stars, shares, plan.spectral_smoothing)
+    penalties = [replace(first, smoothing=each) for each in weights]
     if reason:
         detail(f"`smoothing` chosen: {penalties[0].in_words()}, by {reason}")
     return penalties

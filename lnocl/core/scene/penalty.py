@@ -51,8 +51,8 @@ class Penalty:
     shares : tuple of float
         With several skies that by which `smoothing` is multiplied in each; empty for 1.
     spectral : float
-        Weight of the term between each pixel of one sky and that of the next, such as the slices
-        of a cube; zero or more.
+        That by which `smoothing` is multiplied between each pixel of one sky and that of the next,
+        such as the slices of a cube; zero or more.
     stars : StarPrior or None
         Of star fluxes, electrons, which the objective leaves out.
     exposure : float or None

@@ -33,7 +33,8 @@ def scaled(penalty: Penalty, scene: Scene) -> Scaled:
     """
     longer = 1.0 if penalty.exposure is None else penalty.exposure / scene.mean_exposure
     smoothing: Any = _scaled("smoothing", penalty.smoothing, longer, scene)
-    spectral = _scaled("spectral_smoothing", penalty.spectral, longer, scene)
+    between = penalty.spectral * penalty.smoothing if scene.mixing is not None else 0.0
+    spectral = _scaled("spectral_smoothing", between, longer, scene)
     if scene.mixing is not None:
         smoothing = smoothing * np.reshape(penalty.shares or [1.0] * scene.n_skies, (-1, 1, 1))
     smoothing_map, edge = None, 0.0 * smoothing
