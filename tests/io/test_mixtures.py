@@ -51,7 +51,7 @@ def test_weights_are_numbers_or_by_keywords(images, given, weights, errors):
         (["line=1,0", "on=1/NOTHING"], "NOTHING of 1.fits is 0; a weight of components is above"),
         (["line=1,0", "on=1+-x,1"], "'on' has the error 'x'; give a number, zero or more"),
         (["line=1,0", "on=1+--1,1"], "'on' has the error '-1'; give a number, zero or more"),
-        (["line=1,0", "on=-1,1"], "components must be finite and not negative; -1 was given"),
+        (["line=1,0", "on=-1,1"], "components must be 0, or from 1e-06 to 1e+06; -1 was given"),
         (["line=1,0"], "components has 1 name; give 2 to 64, or leave it out"),
         (["line=1", "on=1"], "the images do not tell line and on apart: give one that shows"),
     ],
