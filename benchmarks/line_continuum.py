@@ -33,8 +33,9 @@ from lnocl.simulation import fizeau_psf, hh34
 
 SIZE, LIGHT, SKY, NOISE = 128, 3e6, 50.0, 3.0
 COMPONENTS = "line", "continuum"
-# Distance from the star along the jet, and radius, of the knots that are measured.
-KNOTS = ((8.0, 4.0), (11.6, 4.0), (24.4, 5.0))
+# Distance from the star along the jet, and radius, of regions with one knot or two. One baseline
+# resolves 10 pixels along the jet.
+KNOTS = ((9.8, 6.0), (24.4, 6.0), (35.4, 6.0))
 
 
 def nebula(star):

@@ -337,3 +337,11 @@ def test_refinements_of_filters_are_joined_image_by_image():
     assert found.psf_error == 0.2
     assert found.may_be_faked.shape == (2, 3, 4)
     assert joined_refinement([[0], [1]], [None, None], 2) is None
+
+
+def test_the_resolution_is_that_of_the_filter_which_resolves_least():
+    from lnocl.core.scene.texture import resolution
+
+    scene = Scene(observe(), [STAR])
+    alone = [resolution(scene.of_images([j])) for j in range(2)]
+    assert resolution(scene) == max(alone) > min(alone)

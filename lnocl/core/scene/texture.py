@@ -120,8 +120,11 @@ def resolution(scene: Scene) -> float:
 
     It is that of the PSF whose OTF is the root of the mean of ``|OTF_j|^2``, each with the
     response of the images' pixels, in pixels of the sky. Images count by what they tell of a flat
-    sky.
+    sky. With several skies it is that of the filter which resolves least: components need all.
     """
+    if scene.mixing is not None:
+        images = map(scene.mixing.images_of, range(len(scene.mixing.rows)))
+        return max(resolution(scene.of_images(which)) for which in images)
     return _width(sum(d * each for d, each in zip(_depths(scene), _powers(scene), strict=True)))
 
 
