@@ -170,6 +170,9 @@ def test_replicas_measure_each_component_and_how_bright_it_is_over_the_continuum
     values, errors = found.values, found.standard_errors
     assert values[4] == pytest.approx(values[2] / values[3])
     assert (errors > 0).all()
+    # Ratios follow from the light: a drawn sky has another, and its ratio other errors.
+    _star, _same, line, continuum, ratio = found.errors.T
+    np.testing.assert_allclose(ratio, (line - values[4] * continuum) / values[3])
     assert found.error_map.shape == (2, *SHAPE)
     truth = regions[0].to_mask("exact").multiply(LINE).sum()
     assert abs(values[2] - truth) < 3 * errors[2]
