@@ -131,10 +131,10 @@ lines = {
     "one fit": in_frame(together.component("line")),
 }
 inside = distance(*NEBULA[:2]) < NEBULA[2]
-print("rings over the nebula, ADU (largest, rms), and its light as the images show it, ADU")
-for name, line in lines.items():
-    seen = fftconvolve(line, narrow, mode="same") if name in ("each alone", "one fit") else line
-    print(f"{name:12} {rings(line)[0]:5.0f} {rings(line)[1]:5.0f} {seen[inside].sum():8.0f}")
+shown = lines | {"one fit, blurred": fftconvolve(lines["one fit"], wide, mode="same")}
+print("rings over the nebula, ADU (largest, rms), and light of a part of it, ADU")
+for name, line in shown.items():
+    print(f"{name:16} {rings(line)[0]:5.0f} {rings(line)[1]:5.0f} {line[inside].sum():8.0f}")
 region = CirclePixelRegion(PixCoord(NEBULA[0] - X, NEBULA[1] - Y), NEBULA[2])
 replicas = together.bootstrap(REPLICAS, regions=[region])
 names = [quantity.name for quantity in replicas.quantities]
@@ -144,10 +144,9 @@ if options.picture:
     import matplotlib.pyplot as plt
 
     panels = {"H alpha": on} | lines
-    figure, axes = plt.subplots(1, len(panels), figsize=(4 * len(panels), 4))
+    figure, axes = plt.subplots(1, 5, figsize=(20, 4.3), layout="constrained")
     for axis, (name, panel) in zip(axes, panels.items(), strict=True):
         axis.imshow(panel[window], origin="lower", cmap="gray", vmin=-300, vmax=3000)
         axis.set_title(name)
         axis.axis("off")
-    figure.tight_layout()
     figure.savefig(options.picture)
