@@ -69,6 +69,15 @@ naco-betapic carlgogo/VIP_extras a7ec7ac9aeabcb5df73b9ea57270c6d66f9e3f57
     1ebe4212da8dd0d02b19eefbcd473498c5c1ebc5ad348161ed2a9ade1eb8a519
   11520 datasets/naco_betapic_psf.fits
     ca4e0ad99c4119f3ad4e9b33fad9b157746343d8b54f4668681dfa1a398315be
+not-nebula-ou5 will-henney/teresa-pn-ou5 97550c855dbf714125c088fbc699a5a1f358e47e
+  1287360 data/nordic-images/nordic-ou5-ha-00-regrid.fits
+    b0c487e331cf1d166e8182d6e709cf86c5cc961b6fdd1eee0b21c1ad971d0837
+  1287360 data/nordic-images/nordic-ou5-ha-01-regrid.fits
+    b19d931161f9db0c5c9537158990591f7ac94b4c77a3a8bac0f029a14cd38009
+  1287360 data/nordic-images/nordic-ou5-cont-00-regrid.fits
+    f9be4560fe961fb9a190571a6d35cd0bd8535af6dbe07f323cf990368f62decd
+  1287360 data/nordic-images/nordic-ou5-cont-01-regrid.fits
+    a2dbec425a9e57fb004666a12c05c3fb29eb39642c2dbf24cde58dbcb07d6189
 spitzer-glimpse astropy/photutils-datasets 8c97b4fa3a6c9e6ea072faeed2d49a20585658ba
   2113920 data/spitzer_example_image.fits spitzer_glimpse_irac2_l18.fits
     4b9cf15419de311fc683a9c378327a0b28bfee29d01e4fdbb9dc5780417f7ebc

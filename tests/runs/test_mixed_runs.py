@@ -198,6 +198,9 @@ def test_replicas_measure_each_component_and_how_bright_it_is_over_the_continuum
     assert covariances[2, 3] < 0  # what the line has the continuum lacks
     assert values[4] == pytest.approx(values[2] / values[3])
     assert (errors > 0).all()
+    # Ratios follow from the light: a drawn sky has another, and its ratio other errors.
+    _star, _same, line, continuum, ratio = found.errors.T
+    np.testing.assert_allclose(ratio, (line - values[4] * continuum) / values[3])
     assert found.error_map.shape == (2, *SHAPE)
     # What the star may have more or less of, both components have: so has their ratio.
     of_star = found.shares[2] - values[4] * found.shares[3]

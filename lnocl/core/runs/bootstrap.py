@@ -19,6 +19,7 @@ from lnocl.core.runs.quantities import (
     in_electrons,
     measure,
     measure_part,
+    propagate,
     quantities_of,
 )
 from lnocl.core.runs.repeated import RerunWithCounts
@@ -324,12 +325,15 @@ def bootstrap(
     size = 1 if parallel else min(_together(outcome), max(n - found.n, 1))
     batches = [range(k, min(k + size, n)) for k in range(found.n, n, size)]
     make = partial(_Measuring, outcome, parts, seed, found.resolution, size)
+    names = outcome.scene.observation.component_names
     with (
         Progress(n, "replica", progress, "replicas") as bar,
         closing(work(make, batches, parallel)) as measured,
     ):
         bar.update(found.n)
         for each in chain.from_iterable(measured):
+            for changes in (each.errors, each.of_psfs):
+                propagate(changes, found.values, parts, names)
             found = replace(
                 found,
                 errors=np.concatenate([found.errors, each.errors]),

@@ -73,6 +73,21 @@ def measure_part(part: Part, extended: Array, light: Array, names: Sequence[str]
     return np.append(found, ratios)
 
 
+def propagate(errors: Array, values: Array, parts: Sequence[Part], names: Sequence[str]) -> None:
+    """Set errors of ratios, of all quantities (..., k), to what those of their light make of them.
+
+    A drawn sky may have less light than the reconstruction, and its ratio then has another error.
+    """
+    pairs = [_compared(part, names) for part in parts]
+    lights = [len(part.labels()) * (len(names) or 1) for part in parts]
+    at = len(values) - sum(lights) - sum(map(len, pairs))
+    for n, compared in zip(lights, pairs, strict=True):
+        for i, (k, m) in enumerate(compared, start=at + n):
+            change = errors[..., at + k] - values[i] * errors[..., at + m]
+            errors[..., i] = change / (values[at + m] or np.nan)
+        at += n + len(compared)
+
+
 def _compared(part: Part, names: Sequence[str]) -> list[tuple[int, int]]:
     """Return which components' light in a region is divided by which: all by the continuum's."""
     if isinstance(part, Profile) or CONTINUUM not in names:
