@@ -137,13 +137,18 @@ def details(result: Result) -> list[str]:
 
 def _star_rows(result: Result, unit: Unit) -> list[tuple[str, str]]:
     """Return label and flux of each star, of one epoch or of several."""
-    n, shown, word = result._observation.n_epochs, [], result._observation.epoch_word
+    observation, shown = result._observation, []
+    n, labels, word = observation.n_epochs, observation.epoch_labels, observation.epoch_word
     stars = result.star_positions[::n], result.star_fluxes, result.star_flux_errors
     fluxes, errors = (np.reshape(each, (-1, n)) for each in stars[1:])
     for k, (place, flux, error) in enumerate(zip(stars[0], fluxes, errors, strict=True), 1):
         seen, words = np.isfinite(flux), NOT_SHOWN
         if seen.sum() == 1:
             words = unit.flux(flux[seen][0], error[seen][0])
+        elif seen.any() and result.component_names and n <= MAX_COLUMNS:
+            pairs = zip(labels, flux / unit.electrons, error / unit.electrons, strict=True)
+            each = (f"{with_error(*numbers)} in {label}" for label, *numbers in pairs)
+            words = f"{'; '.join(each)}, {unit.name}"
         elif seen.any():
             middle = float(np.median(error[seen]))
             low, high = (

@@ -348,3 +348,12 @@ def test_the_resolution_is_that_of_the_filter_which_resolves_least():
     scene = Scene(observe(), [STAR])
     alone = [resolution(scene.of_images([j])) for j in range(2)]
     assert resolution(scene) == max(alone) > min(alone)
+
+
+def test_fluxes_of_many_stars_are_told_with_their_filters():
+    stars = [(5, 4), (9, 8), (14, 11), (20, 4), (26, 11)]
+    found = lnocl.deconvolve(observe(), stars, **FIXED, smoothing=0.01)
+    line = str(found).splitlines()[1]
+    assert line.startswith("star 2 (9, 8)")
+    assert " in line + continuum; " in line
+    assert line.endswith(" in continuum, electrons")
