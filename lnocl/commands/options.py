@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from lnocl.errors import InputError, note
+from lnocl.io.calibration import EACH
 from lnocl.io.names import ERR, parse_kind
 from lnocl.parallel import CURRENT
 
@@ -172,17 +173,19 @@ def placed_file(word: str) -> str:
 
 
 def mixture(word: str) -> str:
-    """Return a word ``NAME=WEIGHT,WEIGHT,...``.
+    """Return a word ``NAME=WEIGHT,WEIGHT,...``, or each.
 
     Raises
     ------
     argparse.ArgumentTypeError
         Another text.
     """
+    if word == EACH:
+        return word
     name, weights = parse_kind(word)
     if not (name.strip() and all(each.strip() for each in weights.split(","))):
         raise argparse.ArgumentTypeError(
-            f"{word!r} is not NAME=WEIGHT,WEIGHT,..., such as line=1,0 for two images"
+            f"{word!r} is not NAME=WEIGHT,WEIGHT,..., such as line=1,0 for two images, nor each"
         )
     return word
 

@@ -8,6 +8,8 @@ from typing import Literal, NamedTuple
 from lnocl.core.scene.observation import PsfCentre
 
 Word = str | float
+# Components of which each image shows one.
+EACH = "each"
 
 
 class Calibration(NamedTuple):
@@ -75,7 +77,9 @@ class Calibration(NamedTuple):
         image, or one weight for all, as in line=1,0 and continuum=1,1 for an image in a line and
         one beside it. A weight is a number; one with its standard error, as in 0.93+-0.02; or a
         keyword of the images' headers, or 1 over it, as in continuum=1/PHOTFLAM. Weights by
-        keywords are divided by the largest of their component. May be repeated (default: one sky).
+        keywords are divided by the largest of their component. May be repeated. The word each is
+        for images that show a sky of their own each, such as bands or the slices of a cube
+        (default: one sky).
 
         A standard error is that of the weight after this division.
     oversample, effective_psfs, psf_centre, psf_error

@@ -61,7 +61,7 @@ class Stack(NamedTuple):
         return self.headers[0]
 
 
-def read_stack(paths: Sequence[str], may_differ: bool = False) -> Stack:
+def read_stack(paths: Sequence[str], may_differ: bool = False, of_one_sky: bool = True) -> Stack:
     """Read images: one FITS file each, or one file with a cube.
 
     The image of a file is the one named, as in ``FILE[SCI,1]`` (`lnocl.io.names`); else the
@@ -77,6 +77,8 @@ def read_stack(paths: Sequence[str], may_differ: bool = False) -> Stack:
         axes of length 1 are left out.
     may_differ : bool
         Whether images in several files may have several shapes.
+    of_one_sky : bool
+        Whether the planes of a cube are to be images of one sky.
 
     Returns
     -------
@@ -101,7 +103,7 @@ def read_stack(paths: Sequence[str], may_differ: bool = False) -> Stack:
     for path, image in zip(paths, images, strict=True):
         expected = image.shape if may_differ else images[0].shape
         _check_shape(path, image.shape, paths[0], expected, alone=len(paths) == 1)
-    if images[0].ndim == 3 and len(images[0]) > 1:
+    if images[0].ndim == 3 and len(images[0]) > 1 and of_one_sky:
         _refuse_colours(paths[0], str(headers[0].get("CTYPE3", "")).strip().upper())
     planes = list(images[0].reshape(-1, *images[0].shape[-2:])) if len(images) == 1 else images
     shapes = [(plane.shape[0], plane.shape[1]) for plane in planes]
@@ -340,6 +342,6 @@ def _refuse_colours(path: str, kind: str) -> None:
     if kind.startswith(NOT_EXPOSURES):
         raise InputError(
             f"{path} is a cube along {kind}, whose planes are not images of one sky; give one "
-            "plane, in a file of its own. If they are images of one sky, take CTYPE3 out of its "
-            "header"
+            "plane, in a file of its own, or `components` each for a sky of each. If they are "
+            "images of one sky, take CTYPE3 out of its header"
         )

@@ -14,7 +14,7 @@ from lnocl.core.scene.observation import Observation
 from lnocl.core.scene.psfs import PSF_ERROR, check_psfs
 from lnocl.core.scene.transforms import enlarged
 from lnocl.errors import InputError, counted, note, warn
-from lnocl.io.calibration import Calibration, Word
+from lnocl.io.calibration import EACH, Calibration, Word
 from lnocl.io.electrons import Electrons
 from lnocl.io.fitsread import keyword_number, read_extension, read_stack
 from lnocl.io.image_files import ImageFiles
@@ -100,7 +100,9 @@ class _Reader:
         self._paths, self._calibration = images, calibration
         self._images, self._maps = self._files.stack, self._files.maps
         self._electrons = Electrons(self._files)
-        self._psf_paths, self._psfs = psfs, read_stack(psfs, calibration.align is not None)
+        of_one_sky = EACH not in calibration.components
+        self._psf_paths = psfs
+        self._psfs = read_stack(psfs, calibration.align is not None, of_one_sky)
         self._grids = [read_grid(path) for path in psfs if is_grid(path)]
         if len(self._grids) not in (0, len(psfs)):
             raise InputError("give grids of PSFs for all images, or for none")

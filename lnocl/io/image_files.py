@@ -10,7 +10,7 @@ import numpy as np
 from lnocl.core.scene.arrays import Array
 from lnocl.core.scene.transforms import enlarged
 from lnocl.errors import InputError
-from lnocl.io.calibration import Calibration
+from lnocl.io.calibration import EACH, Calibration
 from lnocl.io.fitsread import keyword_number, read_extension, read_keyword, read_stack
 from lnocl.io.maps import Maps
 from lnocl.io.noise import NoiseMap, read_noise_map
@@ -36,7 +36,8 @@ class ImageFiles:
 
     def __init__(self, paths: Sequence[str], calibration: Calibration) -> None:
         self.paths, self.calibration = paths, calibration
-        self.stack = read_stack(paths, calibration.align is not None)
+        of_one_sky = EACH not in calibration.components
+        self.stack = read_stack(paths, calibration.align is not None, of_one_sky)
         self.maps = Maps(self.stack.data.shape, self.stack.shapes)
         self.maps.sha256["images"] = self.stack.sha256
 

@@ -5,7 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
+
 from lnocl.errors import InputError, counted
+from lnocl.io.calibration import EACH
 from lnocl.io.image_files import ImageFiles
 from lnocl.io.names import parse_kind
 
@@ -26,6 +29,10 @@ def read_components(files: ImageFiles, words: Sequence[str]) -> dict[str, Any]:
     """
     weights, errors = dict[str, list[float]](), dict[str, list[float]]()
     p = len(files.stack.data)
+    if EACH in words:
+        if len(words) > 1:
+            raise InputError("`components` each names all of them; leave the others out")
+        return {"components": {f"image {j + 1}": row for j, row in enumerate(np.eye(p))}}
     for word in words:
         name, texts = parse_kind(word)
         if name in weights:

@@ -131,7 +131,7 @@ class SavedResult:
             return "there is no table STARS"
         n_labels = len(self.epoch_labels)
         n_epochs = int(np.max(self.tables["STARS"].get("epoch", 0.0), initial=0.0)) + 1
-        if n_labels != n_epochs and (n_labels or n_epochs > 1):
+        if n_labels != n_epochs and (n_labels or n_epochs > 1) and self.stars:
             return f"EPOCHS has {n_labels} labels of {n_epochs} epochs"
         n_skies, shape = len(self.component_names), self.extended.shape
         if shape[:-2] != (n_skies,) * bool(n_skies) or len(shape) < 2:

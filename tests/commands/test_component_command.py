@@ -193,3 +193,19 @@ def test_a_file_without_its_names_is_refused(result, capsys, part):
         hdus.writeto("damaged.fits", overwrite=True)
     assert cli.main(["report", "damaged.fits", "-o", "damaged.html"]) == 1
     assert "damaged.fits is not a result" in one_complaint(capsys.readouterr())
+
+
+def test_the_slices_of_a_cube_have_a_sky_each(files, tmp_path, monkeypatch, capsys):
+    """There is no star, so that there are filters without fluxes."""
+    monkeypatch.chdir(tmp_path)
+    images = [fits.getdata(files / f"{name}.fits") for name in ("on", "off")]
+    header = fits.Header({"CTYPE3": "WAVE", "BUNIT": "electron"})
+    fits.writeto("cube.fits", np.array(images), header)
+    given = ["--psf", str(files / "psf.fits"), "--background", "30", "--engine", "numpy"]
+    how = [*given, "--stop", "none", "--n-iter", "3", "--component", "each"]
+    how += ["--spectral-smoothing", "0.5", "--smoothing", "0.1"]
+    assert cli.main(["deconvolve", "cube.fits", *how, "-o", "out.fits"]) == 0
+    assert [line.split()[0] for line in capsys.readouterr().out.splitlines()[:2]] == ["image"] * 2
+    saved = read_result("out.fits")
+    assert saved.extended.shape == (2, N, N)
+    assert cli.main(["plot", "out.fits", "-o", "pictures"]) == 0

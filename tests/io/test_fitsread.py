@@ -200,9 +200,10 @@ class TestRefusedFiles:
             fitsread.read_stack([path])
         assert str(caught.value) == (
             f"{path} is a cube along {kind.upper()}, whose planes are not images of one sky; give "
-            "one plane, in a file of its own. If they are images of one sky, take CTYPE3 out of "
-            "its header"
+            "one plane, in a file of its own, or components each for a sky of each. If they are "
+            "images of one sky, take CTYPE3 out of its header"
         )
+        assert len(fitsread.read_stack([path], of_one_sky=False).data) == n
 
     def test_a_cube_among_several_files(self, tmp_path):
         image = save(tmp_path / "a.fits", fits.PrimaryHDU(IMAGE))

@@ -64,3 +64,11 @@ def test_what_cannot_be_weights_is_refused(images, given, told):
 def test_without_words_there_is_one_sky(images):
     assert observe().component_names == ()
     assert observe().images.shape == IMAGES.shape
+
+
+def test_each_image_may_show_a_sky_of_its_own(images):
+    found = observe(components=["each"])
+    assert found.component_names == ("image 1", "image 2")
+    assert found.components.tolist() == [[1, 0], [0, 1]]
+    with pytest.raises(InputError, match="each names all of them; leave the others out"):
+        observe(components=["each", "line=1,0"])
