@@ -282,6 +282,26 @@ def test_levels_and_halos_are_fitted_filter_by_filter(kind):
     assert abs(found.extended_flux[0][0] - LINE.sum()) < 3 * found.extended_flux[1][0]
 
 
+def test_levels_are_fitted_where_those_of_one_filter_alone_have_an_error():
+    images = np.random.default_rng(3).poisson(models())
+    given = {"background": 10.0, "psf_error": 0.0, "components": WEIGHTS}
+    observation = lnocl.Observation(images, psfs_of(2), background_error=[0.0, 3.0], **given)
+    found = lnocl.deconvolve(observation, [STAR], engine="numpy", n_iter=10)
+    (told,) = found._findings.levels_in_words()
+    assert told.startswith("`images[1]`: background ")
+
+
+def test_a_psf_that_filters_share_stays_one_where_it_is_not_mended():
+    given = {"background": 10.0, "components": WEIGHTS, "psf_scatter": 0.01 * psfs_of(1)[0]}
+    observation = lnocl.Observation(models(), psfs_of(1)[0], **given)
+    parts = [([j], observation.of_images([j])) for j in range(2)]
+    assert observation.joined(parts).psfs.strides[0] == 0
+    parts[0] = [0], parts[0][1].replace(psfs=psfs_of(2)[1])
+    joined = observation.joined(parts)
+    np.testing.assert_allclose(joined.psfs, psfs_of(2)[::-1], rtol=1e-12)
+    np.testing.assert_array_equal(joined.psf_scatter, observation.psf_scatter)
+
+
 def test_start_and_smoothing_are_of_each_sky():
     scene = Scene(observe(), [STAR])
     assert scene.sky_grid == (2, *scene.grid)

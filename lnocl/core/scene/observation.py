@@ -689,11 +689,16 @@ class Observation:
         changes: dict[str, Any] = {"psf_error": max(each.psf_error for _, each in parts)}
         order = np.argsort(np.concatenate([which for which, _ in parts]))
         for name in JOINED:
-            stacks = [getattr(each, name) for _, each in parts]
-            if any(map(len, stacks)):
-                dark = [np.zeros((len(which), *self.psfs.shape[1:])) for which, _ in parts]
-                pairs = zip(stacks, dark, strict=True)
-                changes[name] = np.concatenate([a if len(a) else b for a, b in pairs])[order]
+            stacks = together(*(getattr(each, name) for _, each in parts))
+            shape = max(each.shape[1:] for each in stacks)
+            laid = [
+                np.broadcast_to(each if len(each) else 0.0, (len(which), *shape))
+                for each, (which, _) in zip(stacks, parts, strict=True)
+            ]
+            whole = np.concatenate(laid)[order]
+            # Else what was not mended stays as it is, one array for all images too.
+            if any(map(len, stacks)) and not np.array_equal(whole, getattr(self, name)):
+                changes[name] = whole
         if self.psf_fields:
             fields = [field for _, each in parts for field in each.psf_fields]
             changes["psf_fields"] = tuple(fields[j] for j in order)
