@@ -302,6 +302,28 @@ def test_a_psf_that_filters_share_stays_one_where_it_is_not_mended():
     np.testing.assert_array_equal(joined.psf_scatter, observation.psf_scatter)
 
 
+def test_errors_of_psfs_leave_those_of_weights_in_replicas():
+    scatter = {"psf_scatter": 1e-9 * psfs_of(2)}
+    observation = observe(component_errors={"continuum": [0.3, 0.0]}, **scatter)
+    options = {**FIXED, "smoothing": 0.01, "pad": 0}
+    outcome = lnocl.deconvolve(observation, [STAR], **options)._findings
+    (replica,) = Replicas(outcome, 0).reconstruct(0)
+    light, again = (
+        each.light.sum(axis=(1, 2)) for each in (replica.found, replica.found_with_psfs)
+    )
+    np.testing.assert_allclose(again, light, rtol=1e-3)
+
+
+def test_what_replicas_draw_has_the_weights_that_are_given():
+    lights = []
+    for error in (0.3, 0.0):
+        errors = {"component_errors": {"continuum": [error, 0.0]}, "background_error": 3.0}
+        found = lnocl.deconvolve(observe(**errors), [STAR], engine="numpy", n_iter=10)
+        assert found._findings.has_levels
+        lights.append(Replicas(found._findings, 0).reconstruct(0)[0].drawn.light)
+    np.testing.assert_array_equal(*lights)
+
+
 def test_start_and_smoothing_are_of_each_sky():
     scene = Scene(observe(), [STAR])
     assert scene.sky_grid == (2, *scene.grid)

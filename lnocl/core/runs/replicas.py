@@ -115,10 +115,12 @@ class Replicas:
         drawn_skies = [texture.draw(rng) for texture in self._textures]
         sky = np.reshape(drawn_skies, scene.sky_grid)
         estimate = Estimate.of_scaled(scene, sky, self._outcome.estimate.fluxes)
-        model = self._mixed_otherwise(self._model, np.random.default_rng(of_weights))
-        models = list(self._means(model, sky))
+        models = mixed = list(self._means(self._model, sky))
         drawn = Sky(estimate.observed_sky, *self._without_noise(estimate, models), scene.stars)
-        counts = self._draw(models, of_images)
+        model = self._mixed_otherwise(self._model, np.random.default_rng(of_weights))
+        if model is not self._model:
+            mixed = list(self._means(model, sky))
+        counts = self._draw(mixed, of_images)
         prior, star_fluxes = scene.penalty.stars, self._outcome.star_fluxes
         prior = prior and prior.drawn(star_fluxes, np.random.default_rng(of_prior))
         if self._pixels is None:
