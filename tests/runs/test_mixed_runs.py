@@ -324,6 +324,18 @@ def test_what_replicas_draw_has_the_weights_that_are_given():
     np.testing.assert_array_equal(*lights)
 
 
+def test_the_largest_error_of_a_weight_in_a_filter_is_that_of_its_light():
+    errors = []
+    for each in ([0.1, 0.0, 0.0], [0.0, 0.1, 0.0]):
+        images = np.random.default_rng(0).poisson(models()[[0, 0, 1]])
+        weights = {"line": [1, 1, 0], "continuum": [1, 1, 1]}
+        known = {"components": weights, "component_errors": {"continuum": each}}
+        observation = lnocl.Observation(images, psfs_of(2)[[0, 0, 1]], background=10.0, **known)
+        options = {**FIXED, "n_iter": 5, "smoothing": 0.01, "pad": 0}
+        errors.append(lnocl.deconvolve(observation, **options).extended_flux[1])
+    np.testing.assert_allclose(*errors)
+
+
 def test_start_and_smoothing_are_of_each_sky():
     scene = Scene(observe(), [STAR])
     assert scene.sky_grid == (2, *scene.grid)
