@@ -1,5 +1,6 @@
 """Line and continuum in one fit: runs of several skies, their errors and replicas."""
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -334,6 +335,25 @@ def test_the_largest_error_of_a_weight_in_a_filter_is_that_of_its_light():
         options = {**FIXED, "n_iter": 5, "smoothing": 0.01, "pad": 0}
         errors.append(lnocl.deconvolve(observation, **options).extended_flux[1])
     np.testing.assert_allclose(*errors)
+
+
+def test_units_of_components_do_not_change_what_a_filter_is_smoothed_by():
+    found, n = [], np.ones(SHAPE)
+    for unit in (1.0, 0.5):
+        weights = {"line": [unit, 0.0], "continuum": [1, 1]}
+        given = {"components": weights, "exposure": [1.0, 4.0]}
+        result = lnocl.deconvolve(observe(**given), [STAR], engine="numpy", stop=None, n_iter=5)
+        outcome, scene = result._findings, result._findings.scene
+        near = np.sqrt([(3.0 * unit) ** 2 * n, 9.0 * n + 16.0 * n])  # as joined of 3 and 4
+        penalty = replace(scene.penalty, near_stars=near)
+        estimate = replace(outcome.estimate, scene=scene.penalised(penalty))
+        outcome = replace(outcome, estimate=estimate)
+        found += [outcome.of_filter(name).scene.penalty for name in scene.observation.filter_names]
+    for each, other in zip(found[:2], found[2:], strict=True):
+        assert each.smoothing == pytest.approx(other.smoothing)
+        assert each.exposure == 2.5
+        np.testing.assert_allclose(each.near_stars, other.near_stars)
+    np.testing.assert_allclose([each.near_stars[0, 0] for each in found[:2]], [3.0, 4.0])
 
 
 def test_start_and_smoothing_are_of_each_sky():
