@@ -348,7 +348,7 @@ def test_units_of_components_do_not_change_what_a_filter_is_smoothed_by():
         penalty = replace(scene.penalty, near_stars=near)
         estimate = replace(outcome.estimate, scene=scene.penalised(penalty))
         outcome = replace(outcome, estimate=estimate)
-        found += [outcome.of_filter(name).scene.penalty for name in scene.observation.filter_names]
+        found += [outcome.of_filter(name).scene.penalty for name in scene.mixing.filter_names]
     for each, other in zip(found[:2], found[2:], strict=True):
         assert each.smoothing == pytest.approx(other.smoothing)
         assert each.exposure == 2.5

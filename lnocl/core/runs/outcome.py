@@ -276,13 +276,13 @@ class Outcome:
         InputError
             There is no such filter, or there are several.
         """
-        mixing, observation = self.scene.mixing, self.scene.observation
+        mixing = self.scene.mixing
         if mixing is None and label is None:
             return self
-        names = observation.filter_names
-        if mixing is None or label not in names:
-            if not names:
-                raise InputError("this result is of one sky: leave `images_of` out")
+        if mixing is None:
+            raise InputError("this result is of one sky: leave `images_of` out")
+        names = mixing.filter_names
+        if label not in names:
             what = "sources are of one" if label is None else f"{label!r} is no"
             known = " or ".join(map(repr, names))
             raise InputError(f"{what} filter of this result: give `images_of` as {known}")
@@ -306,7 +306,7 @@ class Outcome:
         )
         if refinement is not None:
             refinement = replace(refinement, may_be_faked=refinement.may_be_faked[0])
-        images = observation.of_images(part.images)
+        images = self.observation.of_images(part.images)
         setup = replace(self.setup, observation=images, pad=self.scene.pad, initial_extended=None)
         return replace(
             self,

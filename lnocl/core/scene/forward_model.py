@@ -113,11 +113,9 @@ class Model:
 
     def adjoints(self, arrays: Iterable[Array], factors: Array) -> Array:
         """Return ``sum_j q_kj A_j^T x_j`` for each k, as `adjoints_of` does."""
-        if (mixes := self.scene.mixes) is None:
-            return adjoints_of(self.cameras, arrays, factors)
-        mixed = (factors[:, None] * mixes.T).reshape(-1, len(mixes))
+        mixed = (factors[:, None] * self.scene.mixes.T).reshape(-1, self.shape[0])
         back = adjoints_of(self.cameras, arrays, mixed)
-        return back.reshape(len(factors), -1, *back.shape[1:])
+        return back.reshape(len(factors), *self.scene.sky_grid)
 
     def adjoint_of_cutouts(self, cutouts: Sequence[Cutout]) -> Cutout:
         """Return ``sum_j A_j^T x_j`` of images x_j that are 0 beyond a cutout, one an image.
