@@ -79,10 +79,9 @@ class Replicas:
     def __init__(self, outcome: Outcome, seed: int, n: int = 1) -> None:
         self._outcome, self._seed, scene = outcome, seed, outcome.scene
         width = resolution(scene)
-        stars, hidden = scene.shown_stars, hidden_radii(scene, width)
-        self._textures = [
-            Texture(sky, stars, width, hidden) for sky in _skies(outcome.estimate.extended)
-        ]
+        skies = outcome.estimate.extended.reshape(-1, *scene.grid)
+        given = scene.shown_stars, width, hidden_radii(scene, width)
+        self._textures = [Texture(sky, *given) for sky in skies]
         self._model = Model(scene)
         observation = scene.observation
         self._added = observation.read_noise**2
@@ -188,11 +187,6 @@ class Replicas:
         ny, nx = scene.observation.shape
         for j, image in enumerate(images):
             yield scene.in_electrons(image, j)[:ny, :nx]
-
-
-def _skies(extended: Array) -> Array:
-    """Return one sky or several as several, (K, Ny, Nx)."""
-    return extended.reshape(-1, *extended.shape[-2:])
 
 
 def _draw(model: Array, added: Array, seed: np.random.SeedSequence) -> Array:

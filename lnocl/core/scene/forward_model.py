@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import defaultdict
 from collections.abc import Hashable, Iterable, Iterator, Sequence
 from copy import copy
 from functools import cached_property
@@ -199,10 +200,9 @@ def seen_by(scene: Scene, cameras: Iterable[Camera], extended: Array) -> Iterato
     if scene.mixing is None:
         yield from images_of(cameras, extended)
         return
-    mixed = scene.mixing.seen(extended)
-    spectra: list[dict[Hashable, Spectrum]] = [{} for _ in mixed]
-    for camera, g in zip(cameras, scene.mixing.filters.tolist(), strict=True):
-        yield camera.seen(camera.shared_spectrum(mixed[g], spectra[g]))
+    spectra = defaultdict[int, dict[Hashable, Spectrum]](dict)  # of each of these skies
+    for camera, sky in zip(cameras, skies_seen(scene, extended), strict=True):
+        yield camera.seen(camera.shared_spectrum(sky, spectra[id(sky)]))
 
 
 def model_images(scene: Scene, extended: Array, star_fluxes: Array) -> Iterator[Array]:

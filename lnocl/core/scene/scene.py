@@ -464,15 +464,13 @@ class Scene:
         other.mixing, other.sky_grid = None, self.grid
         other.shown = self.shown[fluxes][:, which]
         other.star_weights = self.star_weights[fluxes]
-        other.owned, other.gains = self.owned[stars], self.gains[which]
-        other.areas, other.seen_areas = self.areas[which], self.seen_areas[which]
+        other.owned = self.owned[stars]
+        for name in ("gains", "areas", "seen_areas", "transmission", "weights"):
+            if (values := getattr(self, name)) is not None:
+                setattr(other, name, values[which])
         for name in ("rotations", "_psfs", "_psfs_of_sky", "_responses_of_sky"):
             if held := vars(self).get(name):
                 setattr(other, name, [held[j] for j in which])
-        if self.transmission is not None:
-            other.transmission = self.transmission[which]
-        if self.weights is not None:
-            other.weights = self.weights[which]
         halos = fluxes[fluxes >= n] - n
         other._halos = [[self._halos[j][k] for k in halos] for j in which] if self._halos else []
         other._own = StarPsfs(observation, other.gains, other._movable, self.grid)
