@@ -186,7 +186,7 @@ def _write(
         quantities,
         _held(found, frames),
         {
-            "REGIONS": _table_of(_regions(parts), measured, _n_of_regions(found)),
+            "REGIONS": _table_of(parts, measured, _n_of_regions(found)),
             "ERROR": found.error_map / frames.electrons,
             "BIAS": found.bias_map / frames.electrons,
             "SHARE": found.share_map,
@@ -200,16 +200,12 @@ def _write(
     )
 
 
-def _regions(parts: Sequence[Part]) -> list[Aperture]:
-    return [each for each in parts if isinstance(each, Aperture)]
-
-
 def _n_of_regions(found: Bootstrap) -> int:
     """Return how many quantities are of regions, which have one of each component, and ratios."""
     return sum(each.at is None for each in found.quantities) - len(found.stated)
 
 
-def _table_of(regions: Sequence[Aperture], measured: QTable, n_rows: int) -> QTable:
+def _table_of(parts: Sequence[Part], measured: QTable, n_rows: int) -> QTable:
     """Return the regions, which are measured last, as a table: name, area, centre and flux.
 
     Of each region it has a row for each component, and for each ratio.
@@ -217,6 +213,7 @@ def _table_of(regions: Sequence[Aperture], measured: QTable, n_rows: int) -> QTa
     from astropy.table import QTable
 
     of_regions = measured[len(measured) - n_rows :]
+    regions = [each for each in parts if isinstance(each, Aperture)]
     means = [
         [each.n_pixels, *(np.average(axis, weights=each.weights) for axis in each.places[::-1])]
         for each in regions

@@ -82,7 +82,7 @@ class Electrons:
         given, found = self._files.calibration, {}
         for name in names:
             for keyword in () if getattr(given, name) else KEYWORDS[name]:
-                value = read_keyword(self._paths[0], self._files.stack.headers[0], keyword)
+                value = read_keyword(*self._files.stack.file_of(0), keyword)
                 if isinstance(value, (int, float)) and 0 < value < np.inf:
                     found[name] = f"{keyword} {value:g}", f"`{name}`={keyword}"
                     break
@@ -132,7 +132,7 @@ class Electrons:
         flags = self._files.extensions("DQ", "mask") if "DQ" in held else [None] * len(variances)
         planes = zip(self._files.stack.data, variances, flags, strict=True)
         found = [
-            electrons_by_variance(image, variance, self._paths[min(j, len(self._paths) - 1)], sums)
+            electrons_by_variance(image, variance, self._files.stack.file_of(j)[0], sums)
             for j, (image, variance, sums) in enumerate(planes)
         ]
         for j, electrons in enumerate(found):
@@ -147,7 +147,7 @@ class Electrons:
             return float(self._by_noise.mean()) if self.in_units is None else None
         if not isinstance(word, str):
             return word
-        found = [self._files.number("gain", j, word) for j in range(len(self._paths))]
+        found = [self._files.stack.number("gain", j, word) for j in range(len(self._paths))]
         for path, gain in zip(self._paths, found, strict=True):
             if gain is None:
                 raise InputError(

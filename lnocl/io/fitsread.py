@@ -48,17 +48,44 @@ class Stack(NamedTuple):
         SHA-256 checksum of each file, in hexadecimal.
     shapes : list of tuple of int
         Shape (ny, nx) of each image. Pixels beyond that of a smaller one are NaN.
+    paths : sequence of str
+        The files.
     """
 
     data: NDArray[np.float64]
     headers: list[fits.Header]
     sha256: list[str]
     shapes: list[tuple[int, int]]
+    paths: Sequence[str] = ()
 
     @property
     def header(self) -> fits.Header:
         """Header of the first image."""
         return self.headers[0]
+
+    def file_of(self, j: int) -> tuple[str, fits.Header]:
+        """Return path and header of the file of image j; a cube has one of all its images."""
+        of_file = min(j, len(self.headers) - 1)
+        return self.paths[of_file], self.headers[of_file]
+
+    def number(self, name: str, j: int, keyword: str, unit: str = "") -> float | None:
+        """Return the number that a keyword has for image j, or None; log it by a name.
+
+        Raises
+        ------
+        InputError
+            The value is not a number.
+        """
+        path, header = self.file_of(j)
+        value = read_keyword(path, header, keyword)
+        if value is None:
+            return None
+        if isinstance(value, bool) or not isinstance(value, (int, float)):
+            raise InputError(
+                f"{keyword} of {path} is {value!r}, not a number; give `{name}` as one"
+            )
+        detail("`images[%d]`: %s %g%s, from %s", j, name.replace("_", " "), value, unit, keyword)
+        return float(value)
 
 
 def read_stack(paths: Sequence[str], may_differ: bool = False, of_one_sky: bool = True) -> Stack:
@@ -112,7 +139,7 @@ def read_stack(paths: Sequence[str], may_differ: bool = False, of_one_sky: bool 
         data = images[0].reshape(-1, *shape)
     else:
         data = np.stack([enlarged(plane, shape, np.nan) for plane in planes])
-    return Stack(data, list(headers), list(sha256), shapes)
+    return Stack(data, list(headers), list(sha256), shapes, paths)
 
 
 def read_single(path: str) -> Stack:
@@ -180,27 +207,6 @@ def date_of(path: str, header: fits.Header) -> Time | None:
         except (TypeError, ValueError):
             continue
     return None
-
-
-def keyword_number(
-    stack: Stack, paths: Sequence[str], name: str, j: int, keyword: str, unit: str = ""
-) -> float | None:
-    """Return the number that a keyword has for image j of a stack, or None; log it by a name.
-
-    Raises
-    ------
-    InputError
-        The value is not a number.
-    """
-    of_file = min(j, len(paths) - 1)  # a cube has one header
-    path = paths[of_file]
-    value = read_keyword(path, stack.headers[of_file], keyword)
-    if value is None:
-        return None
-    if isinstance(value, bool) or not isinstance(value, (int, float)):
-        raise InputError(f"{keyword} of {path} is {value!r}, not a number; give `{name}` as one")
-    detail("`images[%d]`: %s %g%s, from %s", j, name.replace("_", " "), value, unit, keyword)
-    return float(value)
 
 
 class Contents(NamedTuple):

@@ -16,7 +16,7 @@ from lnocl.core.scene.transforms import enlarged
 from lnocl.errors import InputError, counted, note, warn
 from lnocl.io.calibration import EACH, Calibration, Word
 from lnocl.io.electrons import Electrons
-from lnocl.io.fitsread import keyword_number, read_extension, read_stack
+from lnocl.io.fitsread import read_extension, read_stack
 from lnocl.io.image_files import ImageFiles
 from lnocl.io.levels import sky_level, sky_noise
 from lnocl.io.masks import read_mask
@@ -101,7 +101,6 @@ class _Reader:
         self._images, self._maps = self._files.stack, self._files.maps
         self._electrons = Electrons(self._files)
         of_one_sky = EACH not in calibration.components
-        self._psf_paths = psfs
         self._psfs = read_stack(psfs, calibration.align is not None, of_one_sky)
         self._grids = [read_grid(path) for path in psfs if is_grid(path)]
         if len(self._grids) not in (0, len(psfs)):
@@ -131,7 +130,7 @@ class _Reader:
         background = self._background(counts, mask)
         levels = self._without_sky(counts, background)
         read_noise = self._read_noise_words(counts, mask)
-        places = read_places(self._images, self._paths, self._calibration)
+        places = read_places(self._images, self._calibration)
         if places.sha256:
             self._maps.sha256["angle"] = places.sha256
         observation = Observation(
@@ -147,7 +146,7 @@ class _Reader:
             exposure=1.0 if exposure is None else exposure,
             **places.maps,
             **read_components(self._files, self._calibration.components),
-            epochs=read_epochs(self._images, self._paths, self._calibration.epoch),
+            epochs=read_epochs(self._images, self._calibration.epoch),
             oversample=self._calibration.oversample,
             effective_psfs=self._calibration.effective_psfs,
             psf_centre=self._calibration.psf_centre,
@@ -178,10 +177,8 @@ class _Reader:
         """Return the error that was given, or the largest that files of PSFs have."""
         if self._calibration.psf_error is not None:
             return self._calibration.psf_error
-        found = [
-            keyword_number(self._psfs, self._psf_paths, "psf_error", j, WIDTH_ERROR)
-            for j in range(len(self._psf_paths))
-        ]
+        files = range(len(self._psfs.paths))
+        found = (self._psfs.number("psf_error", j, WIDTH_ERROR) for j in files)
         return max(PSF_ERROR if error is None else error for error in found)
 
     def _psf_errors(self) -> dict[str, Any]:
@@ -210,7 +207,7 @@ class _Reader:
         LnoclWarning
             It is not of the shape of the PSFs, and left out.
         """
-        paths, found, n = self._psf_paths, list[Array](), 0
+        paths, found, n = self._psfs.paths, list[Array](), 0
         psfs = list(_in_own_shapes(self._psfs.data, self._psfs.shapes))
         of_each = len(psfs) // len(paths)
         for path in paths:
@@ -254,7 +251,7 @@ class _Reader:
             return None
 
         def seconds(j: int, keyword: str) -> float | None:
-            return self._files.number("exposure", j, keyword, " seconds")
+            return self._images.number("exposure", j, keyword, " seconds")
 
         return self._maps.combine("exposure", self._maps.fill("exposure", words, seconds))
 
@@ -294,7 +291,7 @@ class _Reader:
         def electrons(j: int, word: str) -> float | None:
             if word == "auto":
                 return sky_noise(j, counts[j], mask[j])
-            return self._files.number("read_noise", j, word, " electrons")
+            return self._images.number("read_noise", j, word, " electrons")
 
         return self._maps.fill("read_noise", words, electrons)
 

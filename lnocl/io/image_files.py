@@ -11,7 +11,7 @@ from lnocl.core.scene.arrays import Array
 from lnocl.core.scene.transforms import enlarged
 from lnocl.errors import InputError
 from lnocl.io.calibration import EACH, Calibration
-from lnocl.io.fitsread import keyword_number, read_extension, read_keyword, read_stack
+from lnocl.io.fitsread import read_extension, read_keyword, read_stack
 from lnocl.io.maps import Maps
 from lnocl.io.noise import NoiseMap, read_noise_map
 
@@ -43,11 +43,7 @@ class ImageFiles:
 
     def bunit(self, j: int) -> str:
         """Return the unit of image j, as its header has it; "" without one."""
-        return str(read_keyword(self.paths[j], self.stack.headers[j], "BUNIT") or "")
-
-    def number(self, name: str, j: int, keyword: str, unit: str = "") -> float | None:
-        """Return the number that a keyword has for image j, as `fitsread.keyword_number`."""
-        return keyword_number(self.stack, self.paths, name, j, keyword, unit)
+        return str(read_keyword(*self.stack.file_of(j), "BUNIT") or "")
 
     @cached_property
     def noise(self) -> NoiseMap | None:

@@ -62,8 +62,7 @@ def _weight(files: ImageFiles, name: str, j: int, text: str) -> tuple[float, flo
     if weight is not None:
         return weight, deviation, False
     keyword = value.strip().removeprefix(OVER)
-    path = files.paths[min(j, len(files.paths) - 1)]  # a cube has one header
-    found = files.number("components", j, keyword)
+    path, found = files.stack.file_of(j)[0], files.stack.number("components", j, keyword)
     if found is None:
         raise InputError(
             f"`components` {name!r} has the weight {value!r}, and {path} has no {keyword} in its "

@@ -18,7 +18,7 @@ from lnocl.errors import FileError, InputError, counted, detail, note, warn
 from lnocl.io import sky
 from lnocl.io.calibration import Calibration, Word
 from lnocl.io.fitsfile import open_fits, open_regular
-from lnocl.io.fitsread import Stack, date_of, keyword_number, read_keyword
+from lnocl.io.fitsread import Stack, date_of, read_keyword
 
 if TYPE_CHECKING:
     from astropy.time import Time
@@ -47,7 +47,7 @@ class Places(NamedTuple):
     sha256: list[str]
 
 
-def read_places(stack: Stack, paths: Sequence[str], calibration: Calibration) -> Places:
+def read_places(stack: Stack, calibration: Calibration) -> Places:
     """Return where images lie by `align` or `angle`; warn of what neither heeds.
 
     Raises
@@ -58,25 +58,26 @@ def read_places(stack: Stack, paths: Sequence[str], calibration: Calibration) ->
     if calibration.angle:
         if calibration.align is not None:
             raise InputError("give `angle` or `align`, not both: each has the rotation")
-        transforms, sha256 = _field_rotation(stack, paths, calibration)
+        transforms, sha256 = _field_rotation(stack, calibration)
         return Places({"transforms": transforms}, _without_coordinates(stack.header), sha256)
     if calibration.align is None:
         if len(stack.headers) > 1 and all(map(sky.has_celestial, stack.headers)):
-            _warn_of_places(stack, paths)
+            _warn_of_places(stack)
         return Places({}, stack.header, [])
     if len(stack.headers) != len(stack.data):
         raise InputError(
-            f"{paths[0]} is a cube, with one WCS for all its images; to align them give a file for "
-            "each"
+            f"{stack.paths[0]} is a cube, with one WCS for all its images; to align them give a "
+            "file for each"
         )
-    return _by_coordinates(stack, paths)
+    return _by_coordinates(stack)
 
 
-def _by_coordinates(stack: Stack, paths: Sequence[str]) -> Places:
-    finest = sky.finest(stack.headers, paths, stack.shapes)
-    found = sky.transforms(stack.headers, paths, stack.shapes, finest)
+def _by_coordinates(stack: Stack) -> Places:
+    images = stack.headers, stack.paths, stack.shapes
+    finest = sky.finest(*images)
+    found, path = sky.transforms(*images, finest), stack.paths[finest]
     if finest:
-        note("the sky has the pixels of %s, the smallest: positions are in these", paths[finest])
+        note("the sky has the pixels of %s, the smallest: positions are in these", path)
     is_turned = (found[:, :, :2] != np.eye(2)).any()
     for j, each in enumerate(found):
         if j == finest:
@@ -92,9 +93,7 @@ def _by_coordinates(stack: Stack, paths: Sequence[str]) -> Places:
     return Places(maps, stack.headers[finest], [])
 
 
-def _field_rotation(
-    stack: Stack, paths: Sequence[str], calibration: Calibration
-) -> tuple[Array, list[str]]:
+def _field_rotation(stack: Stack, calibration: Calibration) -> tuple[Array, list[str]]:
     """Return the maps of images of the parallactic angles given, or of a file of these."""
     words, (p, ny, nx) = calibration.angle, stack.data.shape
     sha256 = list[str]()
@@ -108,7 +107,7 @@ def _field_rotation(
                 "file of the angles, or one number for each image"
             )
         each = (words[min(j, len(words) - 1)] for j in range(p))
-        angles = np.array([_angle(stack, paths, j, word) for j, word in enumerate(each)])
+        angles = np.array([_angle(stack, j, word) for j, word in enumerate(each)])
     if len(angles) != p:
         raise InputError(f"{words[0]} has {len(angles)} angles for {counted(p, 'image')}")
     centre = calibration.centre or (nx // 2, ny // 2)
@@ -151,15 +150,14 @@ def read_angles(path: str) -> tuple[Array, str]:
     return values, hashlib.sha256(content).hexdigest()
 
 
-def _angle(stack: Stack, paths: Sequence[str], j: int, word: Word) -> float:
+def _angle(stack: Stack, j: int, word: Word) -> float:
     if isinstance(word, (int, float)):
         return float(word)
-    found = keyword_number(stack, paths, "angle", j, word, " degrees")
+    found = stack.number("angle", j, word, " degrees")
     if found is None:
-        path = paths[min(j, len(paths) - 1)]
         raise InputError(
-            f"{path} has no {word} in its header, and there is no such file; give `angle` as a "
-            "number, another keyword, or a file of the angles"
+            f"{stack.file_of(j)[0]} has no {word} in its header, and there is no such file; give "
+            "`angle` as a number, another keyword, or a file of the angles"
         )
     return found + 0.0  # no negative zero
 
@@ -172,14 +170,14 @@ def _without_coordinates(header: fits.Header) -> fits.Header:
     return header
 
 
-def _warn_of_places(stack: Stack, paths: Sequence[str]) -> None:
+def _warn_of_places(stack: Stack) -> None:
     """Warn of the first image that is not where the first is, by their coordinates."""
     try:
-        found = sky.transforms(stack.headers, paths, stack.shapes)
+        found = sky.transforms(stack.headers, stack.paths, stack.shapes)
     except InputError as error:
         warn(error.message)
         return
-    for path, each in zip(paths, found, strict=True):
+    for path, each in zip(stack.paths, found, strict=True):
         dx, dy = each[:, 2]
         if scale_of(each) != 1.0:
             where = f"has pixels {scale_of(each):.4g} times as large as"
@@ -190,13 +188,13 @@ def _warn_of_places(stack: Stack, paths: Sequence[str]) -> None:
         else:
             continue
         warn(
-            f"{path} {where} {paths[0]}, by their sky coordinates: give `align` wcs, "
+            f"{path} {where} {stack.paths[0]}, by their sky coordinates: give `align` wcs, "
             "unless their pixels were registered"
         )
         return
 
 
-def read_epochs(stack: Stack, paths: Sequence[str], words: Sequence[Word]) -> list[Any] | None:
+def read_epochs(stack: Stack, words: Sequence[Word]) -> list[Any] | None:
     """Return the label of each image's epoch, where there are several.
 
     Raises
@@ -217,14 +215,12 @@ def read_epochs(stack: Stack, paths: Sequence[str], words: Sequence[Word]) -> li
     if words[0] == "each":
         return list(range(p))
     labels = []
-    for j in range(p):
-        of_file = min(j, len(paths) - 1)  # a cube has one header
-        file = paths[of_file], stack.headers[of_file]
+    for file in map(stack.file_of, range(p)):
         by_night = words[0] == "night"
         labels.append(date_of(*file) if by_night else read_keyword(*file, str(words[0])))
         if labels[-1] is None:
             raise InputError(
-                f"{paths[of_file]} has no {'date' if by_night else words[0]} in its header; give "
+                f"{file[0]} has no {'date' if by_night else words[0]} in its header; give "
                 "`epoch` each, another keyword, or a label for each image"
             )
     return _nights(labels) if by_night else [str(label) for label in labels]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -297,12 +297,12 @@ def _panels(view: ResultView, region: Region) -> list[Callable[[Axes], None]]:
             panels.append(partial(_draw_panel, cube[j], there, title, how, marked, 1))
     where = "" if panels and not view.names else f", {region.name}"
     skies = view.skies()
-    top = shared_top(skies.values(), region)
+    there = finer_slices(region.slices(view.shape), view.oversample)
+    top = max(brightest(sky.extended[there]) for sky in skies.values())
     for name, sky in skies.items():
         panels.append(
             partial(draw_extended, view=sky, region=region, title=as_text(name) + where, top=top)
         )
-    there = finer_slices(region.slices(view.shape), view.oversample)
     for name, ratio in view.ratios().items():
         how = Normalize(0.0, highest(ratio[there])), RATIO, as_text(name)
         title = f"{as_text(name)}{where}\n{BLANK}"
@@ -332,22 +332,11 @@ def highest(ratio: Array) -> float:
     return float(np.quantile(known, BRIGHTEST)) if known.any() else 1.0
 
 
-def shared_top(skies: Iterable[ResultView], region: Region) -> float:
-    """Return the brightest pixel that any of several skies has in a region."""
-    return max(
-        brightest(sky.extended[finer_slices(region.slices(sky.shape), sky.oversample)])
-        for sky in skies
-    )
-
-
-def draw_extended(
-    axis: Axes, view: ResultView, region: Region, title: str, top: float | None = None
-) -> None:
-    """Draw a region of the extended source on a stretch up to `top`, or to its brightest pixel."""
+def draw_extended(axis: Axes, view: ResultView, region: Region, title: str, top: float) -> None:
+    """Draw a region of the extended source on a stretch up to `top`."""
     from matplotlib.colors import AsinhNorm
 
     there = finer_slices(region.slices(view.shape), view.oversample)
-    top = brightest(view.extended[there]) if top is None else top
     norm = AsinhNorm(FAINT_SHARE * top, 0.0, top)
     how = norm, COLOUR_MAP, f"{as_text(view.unit)} per pixel"
     is_doubtful = view.doubtful is not None and view.doubtful[there].any()

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 
 from lnocl.core.runs.outcome import mean_over_epochs
 from lnocl.core.scene.arrays import Array
+from lnocl.core.scene.components import Mixing
 from lnocl.core.scene.detector import psfs_on_detector
 from lnocl.core.scene.forward_model import Model
 from lnocl.plotting.light_curves import light_curves
@@ -63,7 +64,8 @@ def noise_of(result: Result, electrons: float) -> Array:
         )[:ny, :nx]
         told *= scene.scale / scene.unit**2
         variances.append(np.divide(1.0, told, out=np.full((ny, nx), np.nan), where=told > 0))
-    noise = np.sqrt(np.einsum("kg,gyx->kyx", observation.mixing.undone**2, variances))
+    undone = cast(Mixing, observation.mixing).undone
+    noise = np.sqrt(np.einsum("kg,gyx->kyx", undone**2, variances))
     return np.asarray(noise / (electrons * observation.oversample**2))
 
 

@@ -113,12 +113,12 @@ def test_epochs(frames, capsys):
 def test_images_of_a_night_are_one_epoch_with_the_date_of_its_first():
     hours = (23, 27, 71.9, 60.1, 73)  # from the first of March on
     headers = [fits.Header({"MJD-OBS": 61100 + hour / 24}) for hour in hours]
-    stack = Stack(np.zeros((5, 2, 2)), headers, [], [])
-    labels = read_epochs(stack, [f"{j}.fits" for j in range(5)], ["night"])
+    stack = Stack(np.zeros((5, 2, 2)), headers, [], [], [f"{j}.fits" for j in range(5)])
+    labels = read_epochs(stack, ["night"])
     assert labels == ["2026-03-01", "2026-03-01", "2026-03-03", "2026-03-03", "2026-03-04"]
     del headers[3]["MJD-OBS"]
     with pytest.raises(InputError, match=r"3\.fits has no date in its header; give epoch each"):
-        read_epochs(stack, [f"{j}.fits" for j in range(5)], ["night"])
+        read_epochs(stack, ["night"])
 
 
 @pytest.mark.exhaustive

@@ -125,7 +125,8 @@ def works_in_parallel(kind):
 
 def detects(kind):
     """The faint star, where the bright one alone is known; and limits."""
-    names = observe(kind)[0].filter_names or [None]
+    mixing = observe(kind)[0].mixing
+    names = [None] if mixing is None else mixing.filter_names
     found = run(kind, (BRIGHT,)).significance(false_alarms=0.01, images_of=names[0])
     varies = "epochs" in kind and names == [None]
     table, flux = found.detections, FLUXES[1] * ((1 + BRIGHTER) / 2 if varies else 1)

@@ -1,5 +1,6 @@
 """Line and continuum in one fit: runs of several skies, their errors and replicas."""
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -283,6 +284,79 @@ def test_levels_and_halos_are_fitted_filter_by_filter(kind):
         assert first.startswith("`images[0]`: background 1")
         assert second.startswith("`images[1]`: background 1")
     assert abs(found.extended_flux[0][0] - LINE.sum()) < 3 * found.extended_flux[1][0]
+
+
+def test_levels_are_fitted_where_those_of_one_filter_alone_have_an_error():
+    images = np.random.default_rng(3).poisson(models())
+    given = {"background": 10.0, "psf_error": 0.0, "components": WEIGHTS}
+    observation = lnocl.Observation(images, psfs_of(2), background_error=[0.0, 3.0], **given)
+    found = lnocl.deconvolve(observation, [STAR], engine="numpy", n_iter=10)
+    (told,) = found._findings.levels_in_words()
+    assert told.startswith("`images[1]`: background ")
+
+
+def test_a_psf_that_filters_share_stays_one_where_it_is_not_mended():
+    given = {"background": 10.0, "components": WEIGHTS, "psf_scatter": 0.01 * psfs_of(1)[0]}
+    observation = lnocl.Observation(models(), psfs_of(1)[0], **given)
+    parts = [([j], observation.of_images([j])) for j in range(2)]
+    assert observation.joined(parts).psfs.strides[0] == 0
+    parts[0] = [0], parts[0][1].replace(psfs=psfs_of(2)[1])
+    joined = observation.joined(parts)
+    np.testing.assert_allclose(joined.psfs, psfs_of(2)[::-1], rtol=1e-12)
+    np.testing.assert_array_equal(joined.psf_scatter, observation.psf_scatter)
+
+
+def test_errors_of_psfs_leave_those_of_weights_in_replicas():
+    scatter = {"psf_scatter": 1e-9 * psfs_of(2)}
+    observation = observe(component_errors={"continuum": [0.3, 0.0]}, **scatter)
+    options = {**FIXED, "smoothing": 0.01, "pad": 0}
+    outcome = lnocl.deconvolve(observation, [STAR], **options)._findings
+    (replica,) = Replicas(outcome, 0).reconstruct(0)
+    light, again = (
+        each.light.sum(axis=(1, 2)) for each in (replica.found, replica.found_with_psfs)
+    )
+    np.testing.assert_allclose(again, light, rtol=1e-3)
+
+
+def test_what_replicas_draw_has_the_weights_that_are_given():
+    lights = []
+    for error in (0.3, 0.0):
+        errors = {"component_errors": {"continuum": [error, 0.0]}, "background_error": 3.0}
+        found = lnocl.deconvolve(observe(**errors), [STAR], engine="numpy", n_iter=10)
+        assert found._findings.has_levels
+        lights.append(Replicas(found._findings, 0).reconstruct(0)[0].drawn.light)
+    np.testing.assert_array_equal(*lights)
+
+
+def test_the_largest_error_of_a_weight_in_a_filter_is_that_of_its_light():
+    errors = []
+    for each in ([0.1, 0.0, 0.0], [0.0, 0.1, 0.0]):
+        images = np.random.default_rng(0).poisson(models()[[0, 0, 1]])
+        weights = {"line": [1, 1, 0], "continuum": [1, 1, 1]}
+        known = {"components": weights, "component_errors": {"continuum": each}}
+        observation = lnocl.Observation(images, psfs_of(2)[[0, 0, 1]], background=10.0, **known)
+        options = {**FIXED, "n_iter": 5, "smoothing": 0.01, "pad": 0}
+        errors.append(lnocl.deconvolve(observation, **options).extended_flux[1])
+    np.testing.assert_allclose(*errors)
+
+
+def test_units_of_components_do_not_change_what_a_filter_is_smoothed_by():
+    found, n = [], np.ones(SHAPE)
+    for unit in (1.0, 0.5):
+        weights = {"line": [unit, 0.0], "continuum": [1, 1]}
+        given = {"components": weights, "exposure": [1.0, 4.0]}
+        result = lnocl.deconvolve(observe(**given), [STAR], engine="numpy", stop=None, n_iter=5)
+        outcome, scene = result._findings, result._findings.scene
+        near = np.sqrt([(3.0 * unit) ** 2 * n, 9.0 * n + 16.0 * n])  # as joined of 3 and 4
+        penalty = replace(scene.penalty, near_stars=near)
+        estimate = replace(outcome.estimate, scene=scene.penalised(penalty))
+        outcome = replace(outcome, estimate=estimate)
+        found += [outcome.of_filter(name).scene.penalty for name in scene.mixing.filter_names]
+    for each, other in zip(found[:2], found[2:], strict=True):
+        assert each.smoothing == pytest.approx(other.smoothing)
+        assert each.exposure == 2.5
+        np.testing.assert_allclose(each.near_stars, other.near_stars)
+    np.testing.assert_allclose([each.near_stars[0, 0] for each in found[:2]], [3.0, 4.0])
 
 
 def test_start_and_smoothing_are_of_each_sky():

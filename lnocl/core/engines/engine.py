@@ -90,4 +90,4 @@ class Engine(Protocol):
 
 def has_weights(scene: Scene) -> bool:
     """Return whether pixels of the extended source differ in ``sum_j A_j^T w_j``."""
-    return scene.weights is not None or scene.mixes is not None
+    return scene.weights is not None or scene.mixing is not None

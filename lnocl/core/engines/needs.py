@@ -28,7 +28,8 @@ def buffer_sizes(
     scene: Scene, program: Program, layout: Layout, stars: StarWindows, n_iter: int
 ) -> dict[str, int]:
     """Return the bytes of each buffer, by the name that the kernels have for it."""
-    p, n, item, k = scene.n_images, scene.n_fluxes, program.dtype.itemsize, scene.n_skies
+    p, n, item = scene.n_images, scene.n_fluxes, program.dtype.itemsize
+    k = scene.observation.n_skies
     pixels, image, pair = layout.pixels_bytes, layout.images.pixels_bytes, 2 * item
     skies, block_sums = k * pixels, k * program.row_blocks * pair
     point = layout.block_bytes // program.grid[1]
@@ -69,7 +70,7 @@ def scaling_sizes(
     scene: Scene, program: Program, layout: Layout, cross: StarWindows
 ) -> dict[str, int]:
     """Return those of the buffers that scaled steps need besides."""
-    item, k = program.dtype.itemsize, scene.n_skies
+    item, k = program.dtype.itemsize, scene.observation.n_skies
     skies, block_sums = k * layout.pixels_bytes, k * program.row_blocks * 2 * item
     return {
         "previous": skies,
@@ -86,12 +87,12 @@ def scaling_sizes(
 
 def cross_sizes(scene: Scene, program: Program, cross: StarWindows) -> dict[str, int]:
     """Return those of the buffers that depend on where the stars are."""
-    item = program.dtype.itemsize
+    item, k = program.dtype.itemsize, scene.observation.n_skies
     return {
         "cross_information": max(cross.bytes, item),
         "cross_corners": max(scene.n_fluxes, 1) * 8,
         "cross_near": cross.near.nbytes,
-        "coupling_sums": max(scene.n_skies * cross.n_blocks_of_all, 1) * 2 * item,
+        "coupling_sums": max(k * cross.n_blocks_of_all, 1) * 2 * item,
     }
 
 

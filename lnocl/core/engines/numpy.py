@@ -38,6 +38,7 @@ class ReferenceEngine:
 
     def __init__(self, scene: Scene, scaling: Scaling | None = None) -> None:
         self.scene, self.scaling = scene, scaling
+        self._mixes = None if scene.mixing is None else scene.mixes
         if scaling is not None:
             self.set_scaling(scaling)
         self.take_images()
@@ -123,9 +124,9 @@ class ReferenceEngine:
         """Make the ratios of the estimate; judge its objective."""
         skies = self._row_spectrum
         if (transmission := self.scene.transmission) is not None:
-            skies = transmit_rows(self._extended, transmission, self.scene.mixes)
+            skies = transmit_rows(self._extended, transmission, self._mixes)
         step = self.scene.oversample if self._phases is None else 1
-        mixes = self.scene.mixes if transmission is None else None
+        mixes = self._mixes if transmission is None else None
         row_spectra = convolve_columns(skies, self._otfs, step, self._phases, mixes)
         observed = (
             self._images,
@@ -183,14 +184,14 @@ class ReferenceEngine:
         """Back-project the ratios to the correction."""
         spectra, otfs, phases = self._ratio_row_spectra, self._otfs, self._phases
         if (transmission := self.scene.transmission) is None:
-            self._row_spectrum = correlate_columns(spectra, otfs, phases, self.scene.mixes)
+            self._row_spectrum = correlate_columns(spectra, otfs, phases, self._mixes)
             return
         alone = [slice(j, j + 1) for j in range(len(otfs))]
         back = [
             correlate_columns(spectra[j], otfs[j], None if phases is None else phases[j])
             for j in alone
         ]
-        self._row_spectrum = gather_rows(np.array(back), transmission, self.scene.mixes)
+        self._row_spectrum = gather_rows(np.array(back), transmission, self._mixes)
 
     def _scale(self) -> None:
         """Scale the estimate by its correction."""

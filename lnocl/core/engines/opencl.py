@@ -166,7 +166,7 @@ class OpenCLEngine:
         scene, rows = self.scene, self._spacing * self.scene.observation.shape[0]
         numbers = {
             "n_images": scene.n_images,
-            "n_skies": scene.n_skies,
+            "n_skies": scene.observation.n_skies,
             "n_stars": scene.n_fluxes,
             "star_blocks": self._stars.n_blocks,
             "star_columns": self._stars.n_columns,
@@ -198,7 +198,7 @@ class OpenCLEngine:
         self._convolve = self._bind_all(*["transmit_rows"] * is_dimmed, "convolve_columns")
         self._correlate = self._bind_all("correlate_columns", *["gather_rows"] * is_dimmed)
         if self._turned:
-            self._turned.bind(self._bind, self._memory, self.scene.n_skies)
+            self._turned.bind(self._bind, self._memory, self.scene.observation.n_skies)
             self._compare: Callable[[], object] = self._turned.make_ratios
         else:
             self._compare = self._bind("ratio_rows")
@@ -229,8 +229,7 @@ class OpenCLEngine:
         memory.upload_raw("star_corners", self._stars.corners)
         memory.upload_raw("star_near", self._stars.near)
         self.move_stars()
-        ones = np.ones((scene.n_images, 1))
-        memory.upload("mixes", (ones if scene.mixes is None else scene.mixes).ravel())
+        memory.upload("mixes", scene.mixes.ravel())
         for name in ("smoothing", "edge"):
             memory.upload(name, np.ravel(getattr(scene, name)))
         if has_weights(scene):

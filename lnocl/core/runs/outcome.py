@@ -276,31 +276,37 @@ class Outcome:
         InputError
             There is no such filter, or there are several.
         """
-        mixing, observation = self.scene.mixing, self.scene.observation
+        mixing = self.scene.mixing
         if mixing is None and label is None:
             return self
-        names = observation.filter_names
-        if mixing is None or label not in names:
-            if not names:
-                raise InputError("this result is of one sky: leave `images_of` out")
+        if mixing is None:
+            raise InputError("this result is of one sky: leave `images_of` out")
+        names = mixing.filter_names
+        if label not in names:
             what = "sources are of one" if label is None else f"{label!r} is no"
             known = " or ".join(map(repr, names))
             raise InputError(f"{what} filter of this result: give `images_of` as {known}")
         g = names.index(label)
         part, row, penalty = self.estimate.parts[g], mixing.rows[g], self.scene.penalty
-        shares = np.array(penalty.shares or [1.0] * len(row))
         near, refinement = penalty.near_stars, self.psf_refinement
+        # Weights are inverse amplitudes, which add in quadrature; those near stars are what filters
+        # have asked for (`lnocl.core.runs.preparation`).
+        amplitudes = row / (penalty.shares or 1.0)
+        if near is not None:
+            asked = np.linalg.pinv(mixing.rows.T**2)[g]
+            near = np.sqrt(np.einsum("k,kyx->yx", asked, near**2).clip(0.0))
         own = replace(
             penalty,
-            smoothing=penalty.smoothing * float(np.hypot.reduce(row * shares)),
-            near_stars=None if near is None else np.sqrt(np.einsum("k,kyx->yx", row, near**2)),
+            smoothing=penalty.smoothing / float(np.hypot.reduce(amplitudes)),
+            near_stars=near,
             shares=(),
             spectral=0.0,
             stars=None,
+            exposure=self.scene.mean_exposure,
         )
         if refinement is not None:
             refinement = replace(refinement, may_be_faked=refinement.may_be_faked[0])
-        images = observation.of_images(part.images)
+        images = self.observation.of_images(part.images)
         setup = replace(self.setup, observation=images, pad=self.scene.pad, initial_extended=None)
         return replace(
             self,

@@ -17,7 +17,7 @@ from lnocl.core.runs.steady import STEADY, steady_penalty
 from lnocl.core.scene.arrays import Array
 from lnocl.core.scene.components import Mixing
 from lnocl.core.scene.observation import Observation
-from lnocl.core.scene.penalty import Penalty, recommend_smoothing, shares_of_skies
+from lnocl.core.scene.penalty import Penalty, recommend_smoothings
 from lnocl.errors import NotFiniteError, detail, note, of_images
 from lnocl.process import ignored_notes
 from lnocl.progress import Progress
@@ -99,39 +99,37 @@ def _mended(plan: Plan, setup: Setup, progress: bool) -> Mended:
     What the images of a filter show is one sky.
     """
     observation = setup.observation
-    if not (observation.component_names and (plan.does(LEVELS) or plan.does(PSFS))):
+    mixing = observation.mixing if plan.does(LEVELS) or plan.does(PSFS) else None
+    if mixing is None:
         if plan.does(LEVELS):
             from lnocl.core.runs.halos import settle_levels  # which loads scipy
 
             with quietly(), Progress(None, "", bool(progress), "fitting levels"):
                 setup = settle_levels(setup)
         return _judge_psfs(plan, setup, progress) if plan.does(PSFS) else Mended(setup)
-    found, mixing = list[Mended](), observation.mixing
-    images = [mixing.images_of(g) for g in range(len(mixing.rows))]
-    for g, which in enumerate(images):
+    found, names = list[Mended](), mixing.filter_names
+    for g, which in enumerate(mixing.images):
         own = replace(setup, observation=observation.of_images(which), initial_extended=None)
         own = replace(own, initial_star_fluxes=None)
         families = plan.families
         if len(which) == 1 and not plan.is_asked:  # whose place is that of its stars
             families = tuple(name for name in families if name != "shift")
         quiet = ignored_notes() if g >= MOST_TOLD else nullcontext()
-        with of_images(which, observation.filter_names[g]), quiet:
+        with of_images(which, names[g]), quiet:
             found.append(_mended(replace(plan, setup=own, families=families), own, progress))
-    if len(images) > MOST_TOLD:
-        note(f"what was found for {len(images) - MOST_TOLD} other filters is in the result alone")
-    return _joined(setup, mixing, images, found)
+    if len(names) > MOST_TOLD:
+        note(f"what was found for {len(names) - MOST_TOLD} other filters is in the result alone")
+    return _joined(setup, mixing, found)
 
 
-def _joined(
-    setup: Setup, mixing: Mixing, images: Sequence[Sequence[int]], found: Sequence[Mended]
-) -> Mended:
+def _joined(setup: Setup, mixing: Mixing, found: Sequence[Mended]) -> Mended:
     """Return the setup of all images, with what was mended of those of each filter.
 
     The error of PSFs asks each sky to be smoothed by the root of the sum of squares of what it asks
     of what filters show, times their weights.
     """
     mended = [each.setup.observation for each in found]
-    observation = setup.observation.joined(list(zip(images, mended, strict=True)))
+    observation = setup.observation.joined(list(zip(mixing.images, mended, strict=True)))
     moves = any(each.setup.refine_positions for each in found)
     near = [each.near_stars for each in found]
     near_stars, shape = None, observation.sky_shape
@@ -140,7 +138,7 @@ def _joined(
         near_stars = np.sqrt(np.einsum("gk,gyx->kyx", mixing.rows**2, np.array(squares)))
     return Mended(
         replace(setup, observation=observation, refine_positions=moves),
-        joined_refinement(images, [each.refinement for each in found], observation.n_skies),
+        joined_refinement(mixing.images, [each.refinement for each in found], observation.n_skies),
         near_stars,
         all(each.fits for each in found),
         all(each.is_within for each in found),
@@ -192,8 +190,8 @@ def _penalties(plan: Plan, mended: Mended, are_psfs_wrong: bool) -> list[Penalty
     """Return the penalty, or those from which held-out counts choose."""
     if not isinstance(plan.smoothing, str):
         return [Penalty(plan.mu, plan.smoothing, spectral=plan.spectral_smoothing)]
-    observation = mended.setup.observation
-    recommended, shares = recommend_smoothing(observation), shares_of_skies(observation)
+    recommended, *others = recommend_smoothings(mended.setup.observation).tolist()
+    shares = (1.0, *(each / recommended for each in others)) if others else ()
     multiples: Sequence[float] = (1.0,)
     reason = "the noise of the counts"
     if are_psfs_wrong:

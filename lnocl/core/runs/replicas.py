@@ -79,10 +79,9 @@ class Replicas:
     def __init__(self, outcome: Outcome, seed: int, n: int = 1) -> None:
         self._outcome, self._seed, scene = outcome, seed, outcome.scene
         width = resolution(scene)
-        stars, hidden = scene.shown_stars, hidden_radii(scene, width)
-        self._textures = [
-            Texture(sky, stars, width, hidden) for sky in _skies(outcome.estimate.extended)
-        ]
+        skies = outcome.estimate.extended.reshape(-1, *scene.grid)
+        given = scene.shown_stars, width, hidden_radii(scene, width)
+        self._textures = [Texture(sky, *given) for sky in skies]
         self._model = Model(scene)
         observation = scene.observation
         self._added = observation.read_noise**2
@@ -115,10 +114,12 @@ class Replicas:
         drawn_skies = [texture.draw(rng) for texture in self._textures]
         sky = np.reshape(drawn_skies, scene.sky_grid)
         estimate = Estimate.of_scaled(scene, sky, self._outcome.estimate.fluxes)
-        model = self._mixed_otherwise(self._model, np.random.default_rng(of_weights))
-        models = list(self._means(model, sky))
+        models = mixed = list(self._means(self._model, sky))
         drawn = Sky(estimate.observed_sky, *self._without_noise(estimate, models), scene.stars)
-        counts = self._draw(models, of_images)
+        model = self._mixed_otherwise(self._model, np.random.default_rng(of_weights))
+        if model is not self._model:
+            mixed = list(self._means(model, sky))
+        counts = self._draw(mixed, of_images)
         prior, star_fluxes = scene.penalty.stars, self._outcome.star_fluxes
         prior = prior and prior.drawn(star_fluxes, np.random.default_rng(of_prior))
         if self._pixels is None:
@@ -186,11 +187,6 @@ class Replicas:
         ny, nx = scene.observation.shape
         for j, image in enumerate(images):
             yield scene.in_electrons(image, j)[:ny, :nx]
-
-
-def _skies(extended: Array) -> Array:
-    """Return one sky or several as several, (K, Ny, Nx)."""
-    return extended.reshape(-1, *extended.shape[-2:])
 
 
 def _draw(model: Array, added: Array, seed: np.random.SeedSequence) -> Array:

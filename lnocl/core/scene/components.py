@@ -46,19 +46,22 @@ class Mixing:
         The filter of each image, from 0 on: those of equal weights are of one.
     rows : ndarray of float64, shape (G, K)
         The weights of each filter.
+    names : sequence of str
+        Of the components.
     """
 
     weights: Array
     filters: NDArray[np.intp]
     rows: Array
+    names: Sequence[str]
 
     @classmethod
-    def of(cls, weights: Array) -> Mixing:
+    def of(cls, weights: Array, names: Sequence[str] = ()) -> Mixing:
         """Return that of weights, the filters in the order in which images have them first."""
         _, first, numbered = np.unique(weights, axis=0, return_index=True, return_inverse=True)
         order = np.argsort(first)
         filters = np.argsort(order)[numbered.ravel()]
-        return cls(weights, filters, weights[first[order]])
+        return cls(weights, filters, weights[first[order]], names)
 
     def seen(self, skies: Array) -> list[Array]:
         """Return what each filter shows of the skies, (K, ...), as one sky each."""
@@ -73,9 +76,18 @@ class Mixing:
         """Return the skies, shape (K, ...), that are nearest to what each filter shows."""
         return np.einsum("kg,g...->k...", self.undone, np.array(of_filters))
 
-    def images_of(self, g: int) -> list[int]:
-        """Return the images of a filter."""
-        return np.flatnonzero(self.filters == g).tolist()
+    @property
+    def images(self) -> list[list[int]]:
+        """The images of each filter."""
+        return [np.flatnonzero(self.filters == g).tolist() for g in range(len(self.rows))]
+
+    @property
+    def filter_names(self) -> list[str]:
+        """The name of each filter: the components that it shows, with weights where needed."""
+        lit = [[(w, n) for w, n in zip(row, self.names, strict=True) if w] for row in self.rows]
+        short = [" + ".join(name for _, name in each) for each in lit]
+        longer = [" + ".join(f"{w:.4g} {name}" for w, name in each) for each in lit]
+        return [b if short.count(a) > 1 else a for a, b in zip(short, longer, strict=True)]
 
 
 def read_components(field: Field, value: Any, held: Observation) -> Array:
@@ -127,25 +139,14 @@ def in_filters(
     held: Observation, numbered: NDArray[np.intp], labels: Sequence[str]
 ) -> tuple[NDArray[np.intp], tuple[str, ...]]:
     """Return epochs and their labels where stars have a flux in each filter of each."""
-    mixing = Mixing.of(held.components)
+    mixing = Mixing.of(held.components, held.component_names)
     keys = mixing.filters * len(labels) + numbered
     distinct, numbers_of = np.unique(keys, return_inverse=True)
-    names = filter_names(mixing.rows, held.component_names)
-    texts = []
+    names, texts = mixing.filter_names, []
     for key in distinct.tolist():
         g, epoch = divmod(key, len(labels))
         texts.append(names[g] if len(labels) == 1 else f"{names[g]}, {labels[epoch]}")
     return numbers_of.ravel().astype(np.intp), tuple(texts)
-
-
-def filter_names(rows: Array, names: Sequence[str]) -> list[str]:
-    """Return the name of each filter: the components that it shows, with weights where needed."""
-    short = [" + ".join(name for name, w in zip(names, row, strict=True) if w) for row in rows]
-    longer = [
-        " + ".join(f"{w:.4g} {name}" for name, w in zip(names, row, strict=True) if w)
-        for row in rows
-    ]
-    return [b if short.count(a) > 1 else a for a, b in zip(short, longer, strict=True)]
 
 
 def _by_name(parameter: str, value: Mapping[Any, Any], n_images: int) -> Array:

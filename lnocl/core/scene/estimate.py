@@ -69,8 +69,7 @@ class Estimate:
         if scene.mixing is None:
             return [Part(range(scene.n_images), np.arange(scene.n_fluxes), self)]
         found = []
-        for g, sky in enumerate(scene.mixing.seen(self.sky)):
-            images = scene.mixing.images_of(g)
+        for images, sky in zip(scene.mixing.images, scene.mixing.seen(self.sky), strict=True):
             fluxes = scene.fluxes_of(images)
             own = Estimate(scene.of_images(images), sky, self.star_fluxes[fluxes])
             found.append(Part(images, fluxes, own))
@@ -81,15 +80,13 @@ class Estimate:
         mixing = self.scene.mixing
         if mixing is None:
             return change(self)
-        after, scene, fluxes = [], copy(self.scene), self.star_fluxes.copy()
-        for part in self.parts:
-            after.append(change(part.estimate))
-            fluxes[part.fluxes] = after[-1].star_fluxes
-        images = [part.images for part in self.parts]
-        observations = [each.scene.observation for each in after]
-        scene.observation = scene.observation.joined(list(zip(images, observations, strict=True)))
-        pairs = zip(after, self.parts, strict=True)
-        added = mixing.components([each.sky - part.estimate.sky for each, part in pairs])
+        pairs = [(part, change(part.estimate)) for part in self.parts]
+        scene, fluxes = copy(self.scene), self.star_fluxes.copy()
+        for part, after in pairs:
+            fluxes[part.fluxes] = after.star_fluxes
+        observations = [(part.images, after.scene.observation) for part, after in pairs]
+        scene.observation = scene.observation.joined(observations)
+        added = mixing.components([after.sky - part.estimate.sky for part, after in pairs])
         return Estimate(scene, np.maximum(self.sky + added, 0.0), fluxes)
 
     def models(self) -> Iterator[Array]:

@@ -84,8 +84,7 @@ def _levels(scene: Scene, lights: Array, counts: Array, fluxes: Array, least: fl
     from scipy.optimize import nnls
 
     levels = []
-    for g in range(len(scene.mixing.rows)):
-        there = scene.mixing.images_of(g)
+    for there in scene.mixing.images:
         own = scene.shown[:, there].any(axis=1)
         levels.append((lights[there].sum() - of_stars[own].sum()) / seen[there].sum())
     found = nnls(scene.mixing.rows, np.array(levels))[0]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import defaultdict
 from collections.abc import Hashable, Iterable, Iterator, Sequence
 from copy import copy
 from functools import cached_property
@@ -113,11 +114,9 @@ class Model:
 
     def adjoints(self, arrays: Iterable[Array], factors: Array) -> Array:
         """Return ``sum_j q_kj A_j^T x_j`` for each k, as `adjoints_of` does."""
-        if (mixes := self.scene.mixes) is None:
-            return adjoints_of(self.cameras, arrays, factors)
-        mixed = (factors[:, None] * mixes.T).reshape(-1, len(mixes))
+        mixed = (factors[:, None] * self.scene.mixes.T).reshape(-1, self.shape[0])
         back = adjoints_of(self.cameras, arrays, mixed)
-        return back.reshape(len(factors), -1, *back.shape[1:])
+        return back.reshape(len(factors), *self.scene.sky_grid)
 
     def adjoint_of_cutouts(self, cutouts: Sequence[Cutout]) -> Cutout:
         """Return ``sum_j A_j^T x_j`` of images x_j that are 0 beyond a cutout, one an image.
@@ -201,10 +200,9 @@ def seen_by(scene: Scene, cameras: Iterable[Camera], extended: Array) -> Iterato
     if scene.mixing is None:
         yield from images_of(cameras, extended)
         return
-    mixed = scene.mixing.seen(extended)
-    spectra: list[dict[Hashable, Spectrum]] = [{} for _ in mixed]
-    for camera, g in zip(cameras, scene.mixing.filters.tolist(), strict=True):
-        yield camera.seen(camera.shared_spectrum(mixed[g], spectra[g]))
+    spectra = defaultdict[int, dict[Hashable, Spectrum]](dict)  # of each of these skies
+    for camera, sky in zip(cameras, skies_seen(scene, extended), strict=True):
+        yield camera.seen(camera.shared_spectrum(sky, spectra[id(sky)]))
 
 
 def model_images(scene: Scene, extended: Array, star_fluxes: Array) -> Iterator[Array]:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from lnocl.core.scene.arrays import Array, together
-from lnocl.core.scene.components import Mixing, filter_names
+from lnocl.core.scene.components import Mixing
 from lnocl.core.scene.containers import variances
 from lnocl.core.scene.counts import refuse_overflow, without_negative
 from lnocl.core.scene.fields import (
@@ -450,14 +450,10 @@ class Observation:
         return (self.n_skies, *self.sky_shape) if self.component_names else self.sky_shape
 
     @property
-    def filter_names(self) -> list[str]:
-        """The name of each filter: the components that its images show."""
-        return filter_names(self.mixing.rows, self.component_names) if self.component_names else []
-
-    @property
-    def mixing(self) -> Mixing:
-        """How images show the components, where there are any."""
-        return Mixing.of(self.components)
+    def mixing(self) -> Mixing | None:
+        """How images show the components; None where there are none."""
+        names = self.component_names
+        return Mixing.of(self.components, names) if names else None
 
     @property
     def psfs_over_images(self) -> Psfs:
@@ -681,7 +677,6 @@ class Observation:
                 values = getattr(self, name)
                 if values.ndim > field.of_images and values.shape[field.of_images] > 0:
                     changes[name] = _of_images(values, which, field.of_images)
-        changes["exposure"] = self.exposure[which]
         return self._with(changes)._closed()
 
     def joined(self, parts: Sequence[tuple[Sequence[int], Observation]]) -> Observation:
@@ -689,11 +684,16 @@ class Observation:
         changes: dict[str, Any] = {"psf_error": max(each.psf_error for _, each in parts)}
         order = np.argsort(np.concatenate([which for which, _ in parts]))
         for name in JOINED:
-            stacks = [getattr(each, name) for _, each in parts]
-            if any(map(len, stacks)):
-                dark = [np.zeros((len(which), *self.psfs.shape[1:])) for which, _ in parts]
-                pairs = zip(stacks, dark, strict=True)
-                changes[name] = np.concatenate([a if len(a) else b for a, b in pairs])[order]
+            stacks = together(*(getattr(each, name) for _, each in parts))
+            shape = max(each.shape[1:] for each in stacks)
+            laid = [
+                np.broadcast_to(each if len(each) else 0.0, (len(which), *shape))
+                for each, (which, _) in zip(stacks, parts, strict=True)
+            ]
+            whole = np.concatenate(laid)[order]
+            # Else what was not mended stays as it is, one array for all images too.
+            if any(map(len, stacks)) and not np.array_equal(whole, getattr(self, name)):
+                changes[name] = whole
         if self.psf_fields:
             fields = [field for _, each in parts for field in each.psf_fields]
             changes["psf_fields"] = tuple(fields[j] for j in order)
@@ -778,11 +778,9 @@ class Observation:
             rows["exposure"] = _range(self.exposure)
         if len(self.halos):
             rows["halos"] = f"{len(self.halos)}, fitted in each image"
-        if self.component_names:
-            shown = filter_names(self.mixing.rows, self.component_names)
-            rows["components"] = (
-                f"{', '.join(self.component_names)}; images show {', '.join(shown)}"
-            )
+        if mixing := self.mixing:
+            shown = ", ".join(mixing.filter_names)
+            rows["components"] = f"{', '.join(mixing.names)}; images show {shown}"
         elif self.n_epochs > 1:
             rows["epochs"] = f"{self.n_epochs}"
         if self.oversample > 1:

@@ -97,19 +97,11 @@ def recommend_smoothing(observation: Observation) -> float:
     the counts, ``sqrt(sum_j <e_j^2 / g_j> sum K_j^2)``, e_j the exposures over their mean, < > the
     mean over the observed pixels, K_j as these see it. With several skies it is that of the first.
     """
-    return float(_recommended(observation)[0])
+    return float(recommend_smoothings(observation)[0])
 
 
-def shares_of_skies(observation: Observation) -> tuple[float, ...]:
-    """Return that weight of each sky over that of the first; empty where there is one sky.
-
-    The sum of each has ``w_jk^2`` in it, with w_jk the weight of sky k in image j.
-    """
-    weights = _recommended(observation)
-    return tuple((weights / weights[0]).tolist()) if len(weights) > 1 else ()
-
-
-def _recommended(observation: Observation) -> Array:
+def recommend_smoothings(observation: Observation) -> Array:
+    """Return that weight for each sky: ``w_jk^2`` is in the sum, w_jk that of sky k in image j."""
     relative = observation.exposure / mean_exposure(observation)
     variances = np.divide(*together(relative**2, np.maximum(observation.images, 1.0)))
     variance = np.ma.masked_array(variances, observation.mask).mean(axis=(1, 2))

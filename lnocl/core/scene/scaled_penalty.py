@@ -36,7 +36,9 @@ def scaled(penalty: Penalty, scene: Scene) -> Scaled:
     between = penalty.spectral * penalty.smoothing if scene.mixing is not None else 0.0
     spectral = _scaled("spectral_smoothing", between, longer, scene)
     if scene.mixing is not None:
-        smoothing = smoothing * np.reshape(penalty.shares or [1.0] * scene.n_skies, (-1, 1, 1))
+        smoothing = smoothing * np.reshape(
+            penalty.shares or [1.0] * scene.observation.n_skies, (-1, 1, 1)
+        )
     smoothing_map, edge = None, 0.0 * smoothing
     if penalty.near_stars is not None:
         smoothing_map = smoothing + longer * enlarged(penalty.near_stars, scene.grid)

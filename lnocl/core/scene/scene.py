@@ -160,9 +160,8 @@ class Scene:
         self.image_grid = grid_of(observation, self.pad)
         ny, nx = self.image_grid
         self.grid = self.oversample * ny, self.oversample * nx
-        self.mixing = observation.mixing if observation.component_names else None
-        n_skies = observation.n_skies
-        self.sky_grid = self.grid if self.mixing is None else (n_skies, *self.grid)
+        self.mixing = observation.mixing
+        self.sky_grid = (*observation.skies_shape[:-2], *self.grid)
         # A power of two just above the mean; 1 where that is 0.
         n_good = int(np.count_nonzero(~observation.mask))
         # Bad pixels hold 0.
@@ -264,20 +263,14 @@ class Scene:
         return has_weight or self.smoothing_map is not None
 
     @property
-    def n_skies(self) -> int:
-        """Number of skies, K."""
-        return 1 if self.mixing is None else self.mixing.weights.shape[1]
-
-    @property
-    def mixes(self) -> Array | None:
-        """The weight of each sky in each image, shape (p, K); None where there is one sky."""
-        return None if self.mixing is None else self.mixing.weights
+    def mixes(self) -> Array:
+        """The weight of each sky in each image, shape (p, K); 1 where there is one sky."""
+        return np.ones((self.n_images, 1)) if self.mixing is None else self.mixing.weights
 
     @property
     def flux_mixes(self) -> Array:
         """The weights of the skies in the images that show a flux, shape (n_fluxes, K)."""
-        mixes = np.ones((self.n_images, 1)) if self.mixing is None else self.mixing.weights
-        return mixes[self.shown.argmax(axis=1)]
+        return self.mixes[self.shown.argmax(axis=1)]
 
     def prior_of_fluxes(self) -> tuple[Array, Array]:
         """Return flux and precision of the prior of each flux; a precision of 0 where none is."""
@@ -469,19 +462,15 @@ class Scene:
         stars = fluxes[fluxes < n]
         other.observation = observation = self.observation.of_images(which)
         other.mixing, other.sky_grid = None, self.grid
-        other.shown, other.star_weights = (
-            self.shown[fluxes][:, which],
-            self.star_weights[fluxes],
-        )
-        other.owned, other.gains = self.owned[stars], self.gains[which]
-        other.areas, other.seen_areas = self.areas[which], self.seen_areas[which]
+        other.shown = self.shown[fluxes][:, which]
+        other.star_weights = self.star_weights[fluxes]
+        other.owned = self.owned[stars]
+        for name in ("gains", "areas", "seen_areas", "transmission", "weights"):
+            if (values := getattr(self, name)) is not None:
+                setattr(other, name, values[which])
         for name in ("rotations", "_psfs", "_psfs_of_sky", "_responses_of_sky"):
             if held := vars(self).get(name):
                 setattr(other, name, [held[j] for j in which])
-        if self.transmission is not None:
-            other.transmission = self.transmission[which]
-        if self.weights is not None:
-            other.weights = self.weights[which]
         halos = fluxes[fluxes >= n] - n
         other._halos = [[self._halos[j][k] for k in halos] for j in which] if self._halos else []
         other._own = StarPsfs(observation, other.gains, other._movable, self.grid)

@@ -123,8 +123,7 @@ def resolution(scene: Scene) -> float:
     sky. With several skies it is that of the filter which resolves least: components need all.
     """
     if scene.mixing is not None:
-        images = map(scene.mixing.images_of, range(len(scene.mixing.rows)))
-        return max(resolution(scene.of_images(which)) for which in images)
+        return max(resolution(scene.of_images(which)) for which in scene.mixing.images)
     return _width(sum(d * each for d, each in zip(_depths(scene), _powers(scene), strict=True)))
 
 

@@ -176,8 +176,9 @@ class LightOfComponents:
         sums, errors = np.array(found).T
         undone = self._mixing.undone
         fluxes = undone @ sums
-        first = [part.images[0] for part in self._estimate.parts]
-        of_weights = self._estimate.scene.observation.component_errors[first] ** 2 @ fluxes**2
+        each = self._estimate.scene.observation.component_errors
+        most = [each[part.images].max(axis=0) for part in self._estimate.parts]
+        of_weights = np.square(most) @ fluxes**2
         return fluxes, undone * (errors**2 + of_weights) @ undone.T
 
 

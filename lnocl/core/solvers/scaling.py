@@ -191,10 +191,8 @@ def _add_change_by_stars(
     if model.are_large(boxes):  # one after the other, lest all are held
         inverse += model.adjoint(each.on_grid(model.shape[1:]) for each in changes)
         return
-    held, mixes = list(changes), model.scene.mixes
-    if mixes is None:
-        mixes, inverse = np.ones((len(held), 1)), inverse[None]
-    for sky, shares in zip(inverse, mixes.T.tolist(), strict=True):
+    held, skies = list(changes), inverse.reshape(-1, *model.grid)
+    for sky, shares in zip(skies, model.scene.mixes.T.tolist(), strict=True):
         change = model.adjoint_of_cutouts(
             [each._replace(values=w * each.values) for w, each in zip(shares, held, strict=True)]
         )
