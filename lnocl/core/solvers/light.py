@@ -143,8 +143,8 @@ class LightOfComponents:
     shows,
 
     .. math:: F_k = \sum_g U_{kg} F_g, \qquad \operatorname{cov}(F_k, F_l) =
-        \sum_g U_{kg} U_{lg} \Big[ \operatorname{var} F_g
-        + \sum_m F_m^2 \operatorname{var} w_{gm} \Big].
+        \sum_g U_{kg} U_{lg} \left[ \operatorname{var} F_g
+        + \sum_m F_m^2 \operatorname{var} w_{gm} \right].
 
     Parameters
     ----------
