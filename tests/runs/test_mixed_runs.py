@@ -15,6 +15,7 @@ from lnocl.core.runs.halves import Snapshot
 from lnocl.core.runs.replicas import Replicas
 from lnocl.core.scene.scene import Scene
 from lnocl.errors import InputError
+from lnocl.process import ignored_warnings
 from lnocl.result.kept import from_parts, to_parts
 
 SHAPE = 16, 32
@@ -431,3 +432,45 @@ def test_fluxes_of_many_stars_are_told_with_their_filters():
     assert line.startswith("star 2 (9, 8)")
     assert " in line + continuum; " in line
     assert line.endswith(" in continuum, electrons")
+
+
+@pytest.mark.exhaustive
+@pytest.mark.parametrize("by", [0.5, 2.25])
+def test_images_of_a_filter_are_moved_to_where_the_first_see_the_stars(by, log):
+    size, psf = 40, np.zeros((40, 40))
+    y, x = np.indices((size, size))
+
+    def seen(x0, y0, light, width):
+        values = np.exp(-((x - x0) ** 2 + (y - y0) ** 2) / 2 / (width**2 + 1.4**2))
+        return light * values / values.sum()
+
+    psf = seen(20, 20, 1.0, 0.0)[12:29, 12:29]
+    means = [
+        20.0 + seen(19 + a, 18 + a, flux, 0.0) + seen(15 + a, 22 + a, 6e4, 3.0) + line
+        for a, flux, line in ((0.0, 3e5, seen(27, 24, 4e4, 2.0)), (by, 2e5, 0.0))
+    ]
+    given = {"background": 20.0, "psf_error": 0.0, "components": WEIGHTS}
+    observation = lnocl.Observation(np.random.default_rng(6).poisson(means), psf, **given)
+    found = lnocl.deconvolve(observation, [(19, 18)], engine="numpy", n_iter=40)
+    offsets = found._findings.observation.offsets
+    np.testing.assert_allclose(offsets, [[0, 0], [by, by]], atol=0.06)
+    assert any("images moved" in each or "image 1 by" in each for each in log.messages)
+    assert abs(found.extended_flux[0][0] - 4e4) < 3 * found.extended_flux[1][0]
+    stays = {"engine": "numpy", "n_iter": 3, "mend_images": False, "stop": None}
+    with ignored_warnings():  # that the star lies elsewhere
+        left = lnocl.deconvolve(observation, [(19, 18)], **stays)
+    assert not left._findings.observation.offsets.any()
+
+
+def test_only_filters_whose_stars_lie_elsewhere_are_moved():
+    from lnocl.core.runs.outcome import Mended
+    from lnocl.core.runs.preparation import _in_one_place
+    from lnocl.core.runs.start import Setup
+
+    observation = observe(offsets=[[1.0, 0.0], [0.0, 0.0]])
+    setup = Setup(observation, np.array([STAR]), 0, "sgp", "single", "numpy", None)
+    found = [Mended(setup, away=np.array([0.3, 0.2])), Mended(setup, away=np.array([0.25, 0.9]))]
+    moved = _in_one_place(setup, observation.mixing, found).observation.offsets
+    np.testing.assert_allclose(moved, [[1.0, 0.0], [-0.05, 0.7]])
+    near = [found[0], Mended(setup, away=np.array([0.25, 0.22]))]
+    assert _in_one_place(setup, observation.mixing, near) is setup

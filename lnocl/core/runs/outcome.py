@@ -136,6 +136,8 @@ class Mended(NamedTuple):
         Whether the PSFs were judged, and no error is left that noise does not explain.
     is_within : bool
         Whether they were judged, and are off by no more than their `psf_error` holds.
+    away : ndarray of float64, shape (2,)
+        How far stars that are moved lie from where they were given, pixels, their mean by flux.
     """
 
     setup: Setup
@@ -143,6 +145,7 @@ class Mended(NamedTuple):
     near_stars: Array | None = None
     fits: bool = False
     is_within: bool = False
+    away: Array = np.zeros(2)
 
 
 def mean_over_epochs(fluxes: Array, n_epochs: int) -> Array:

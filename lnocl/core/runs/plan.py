@@ -56,6 +56,11 @@ STEADY_STARS = Condition(
     lambda plan: plan.setup.observation.n_epochs == 1 or len(plan.setup.stars) >= FEWEST,
     "fewer than three stars may vary from epoch to epoch",
 )
+# From filter to filter a star has another flux, and lies where it does.
+STEADY_PLACES = Condition(
+    lambda plan: STEADY_STARS.holds(plan) or plan.setup.observation.is_of_one_time,
+    STEADY_STARS.otherwise,
+)
 SHOWS_PSFS = Condition(
     lambda plan: bool((owned(plan.setup.observation, plan.setup.stars) < 0).any()),
     "all stars have PSFs of their own",
@@ -72,7 +77,7 @@ WHOLE = Condition(lambda plan: not plan.in_tiles, "the images are divided into t
 
 # What each step needs, in the order in which reasons are given.
 NEEDS: dict[str, tuple[Condition, ...]] = {
-    PLACES: (AUTO, MENDS, HAS_STARS, SEVERAL, SHOWS_PSFS, STEADY_STARS, NO_HALOS, WHOLE),
+    PLACES: (AUTO, MENDS, HAS_STARS, SEVERAL, SHOWS_PSFS, STEADY_PLACES, NO_HALOS, WHOLE),
     CORES: (AUTO, MENDS, HAS_STARS),
     RAYS: (AUTO, MENDS),
     EXPOSURES: (AUTO, MENDS, HAS_STARS, SEVERAL, STEADY_STARS, NO_HALOS),

@@ -24,6 +24,8 @@ from lnocl.progress import Progress
 
 # Of the smoothing that is recommended, from which held-out counts choose besides none.
 MULTIPLES = (1.0, 3.0, 10.0)
+# Pixels by which the stars of filters may lie apart.
+MISPLACED = 0.1
 # Filters of which each has lines of its own.
 MOST_TOLD = 4
 # Runs with wrong PSFs end where the objective falls by less than this share of itself.
@@ -119,7 +121,22 @@ def _mended(plan: Plan, setup: Setup, progress: bool) -> Mended:
             found.append(_mended(replace(plan, setup=own, families=families), own, progress))
     if len(names) > MOST_TOLD:
         note(f"what was found for {len(names) - MOST_TOLD} other filters is in the result alone")
-    return _joined(setup, mixing, found)
+    return _joined(_in_one_place(setup, mixing, found) if plan.mends else setup, mixing, found)
+
+
+def _in_one_place(setup: Setup, mixing: Mixing, found: Sequence[Mended]) -> Setup:
+    """Return a setup with the images of filters moved to where those of the first see the stars."""
+    observation, moved = setup.observation, np.zeros((setup.observation.n_images, 2))
+    for name, images, each in zip(mixing.filter_names, mixing.images, found, strict=True):
+        away = each.away - found[0].away
+        if np.hypot(*away) > MISPLACED:
+            moved[images] = observation.turns[images] @ away
+            x, y = away
+            note(
+                f"{name}: images moved by ({x:+.2f}, {y:+.2f}) pixels, by their stars "
+                "(`mend_images` False leaves them)"
+            )
+    return replace(setup, observation=observation.moved(moved)) if moved.any() else setup
 
 
 def _joined(setup: Setup, mixing: Mixing, found: Sequence[Mended]) -> Mended:

@@ -435,6 +435,12 @@ class Observation:
         return int(self.epochs.max()) + 1
 
     @property
+    def is_of_one_time(self) -> bool:
+        """Whether there is one epoch, but for filters."""
+        mixing = self.mixing
+        return self.n_epochs == (1 if mixing is None else len(mixing.rows))
+
+    @property
     def epoch_word(self) -> str:
         """What an epoch is called in messages: with components it is a filter."""
         return "filter" if self.component_names else "epoch"
