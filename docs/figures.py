@@ -67,6 +67,12 @@ RECIPES = {
         "python benchmarks/hh34_table.py --mu 8e-8 1e-6 -o $OUT",
         same("validation", "objects errors", "hh34_"),
     ),
+    "narrow_band": Recipe(
+        "5 min",
+        "python examples/real/narrow_band.py $DATA/not-nebula-ou5 "
+        "--picture $OUT/real_narrow_band.png",
+        same("validation", "real_narrow_band"),
+    ),
     "psf_lbti": Recipe(
         "10 s",
         "python examples/real/psf_lbti.py $DATA/lbti-fizeau-altair/lm_180507_009030.fits "
