@@ -48,7 +48,8 @@ def _run(arguments: argparse.Namespace) -> list[str]:
     parts = {"DETECTIONS": table, "SIGNAL": found.signal_to_noise}
     add_parts(again.saved, parts, cards(arguments, found, unit), unit)
     view = found.view(signal=found.signal_to_noise)
-    return finish(arguments, view, table, "detections", _summary_lines(found, table))
+    lines = _summary_lines(found, table, arguments.images_of)
+    return finish(arguments, view, table, "detections", lines)
 
 
 def find(arguments: argparse.Namespace, content: str) -> tuple[Significance, RerunOfFile]:
@@ -127,12 +128,13 @@ def finish(
     return said
 
 
-def _summary_lines(found: Significance, table: QTable) -> list[str]:
+def _summary_lines(found: Significance, table: QTable, images_of: str | None) -> list[str]:
     """Return a line for the field and one for each of the most significant detections."""
+    tested = f" in images of {images_of}" if images_of else ""
     what = f"source {found.width:g} pixels wide" if found.width else "point"
     lines = [
-        f"{counted(len(table), 'detection')} above {found.threshold:.2f} standard deviations, "
-        f"which noise exceeds {found.false_alarms:g} times in such a field "
+        f"{counted(len(table), 'detection')}{tested} above {found.threshold:.2f} standard "
+        f"deviations, which noise exceeds {found.false_alarms:g} times in such a field "
         f"({100 * np.isfinite(found.signal_to_noise).mean():.3g} % of it was tested for a {what})"
     ]
     for k, row in enumerate(table[:MAX_LISTED], 1):

@@ -127,7 +127,8 @@ def test_sources_are_told_in_images_of_one_filter(result, capsys):
     assert "'line' is no filter of this result: give --images-of as" in one_complaint(
         capsys.readouterr()
     )
-    assert cli.main([*detect, "--images-of", FILTERS[0]]) == 0
+    assert cli.main(["detect", "out.fits", "--images-of", FILTERS[0]]) == 0
+    assert f" in images of {FILTERS[0]} above " in capsys.readouterr().out
     assert fits.getheader("out.fits", "SIGNAL")["IMAGESOF"] == "H\\u03b1 + continuum"
     assert fits.getdata("out.fits", "SIGNAL").shape == (N, N)
 
