@@ -123,6 +123,19 @@ INLINE void take_sky(LINES lines, __global const vec *sky)
     BARRIER;
 }
 
+/* sky <- mix lines, added where that has begun. */
+INLINE void add_to_sky(
+    __global vec *sky, const HELD_LINES lines, const real mix, const bool has_begun)
+{
+    FOR_EACH_POINT(i, NY) {
+        const int place = PLACE_OF(i, NY);
+        cvec a = times(POINT(lines, i), mix);
+        if (has_begun)
+            a = add(a, OTF_POINT(sky, i, 0, 1, place));
+        SET_OTF_POINT(sky, i, place, a);
+    }
+}
+
 /* sum_k mixes_k of the skies, in the order in which it may lie in the array of the last. */
 INLINE void mix_skies(
     HELD_LINES mixed, __global const vec *skies, __global const real *mixes, const int n_skies)
@@ -211,7 +224,7 @@ KERNEL void convolve_columns(
 /* skies_k <- IFFT(sum_j mixes_jk conj(otfs_j) FFT(spectra_j)) along the columns: the row spectra of
  * sum_j mixes_jk A_j^T (r_j - w_j) from those of the r_j - w_j. With a transmission
  * spectra_j <- IFFT(conj(otfs_j) FFT(spectra_j)). Arguments as in convolve_columns; the arrays of skies
- * alone are written. steps[FRESH] 0: nothing.
+ * are written, and with several skies those of images may be. steps[FRESH] 0: nothing.
  * Launch: up to COLUMN_BLOCKS groups; with a transmission so many an image. In place.
  * Scratch: SCRATCH_POINTS. Twin: reference.correlate_columns.
  */
@@ -250,31 +263,26 @@ KERNEL void correlate_columns(
             forward_columns(z, from, IMAGE_NY, image_column_roots);
 #endif
             show_column_0(z, IMAGE_NY, block);
-            for (int k = 0; k < n_mixed; ++k) {
-                __global vec *sky = columns + (size_t)k * SPECTRA_SIZE;
-                const real mix = n_mixed > 1 ? mixes[image * n_skies + k] : 1;
-                if (mix == 0 && own > 0)
-                    continue;
-                FOR_EACH_POINT(i, NY) {
-                    const int place = PLACE_OF(i, NY);
-                    cvec product =
-                        multiply_conjugate(POINT_OF_IMAGE(z, i), OTF_POINT(otf, i, 0, 1, place));
-                    if (block == 0 && LANE_OF(i) == 0) {
-                        __global const real *edge = otf_edges + 2 * (image * NY + place);
-                        product =
-                            add_edge(product, edge[0], -edge[1], OPPOSITE(z, i, place, OVERSAMPLE));
-                    }
-                    if (n_mixed > 1) {
-                        product = times(product, mix);
-                        if (own > 0)
-                            product = add(product, OTF_POINT(sky, i, 0, 1, place));
-                        SET_OTF_POINT(sky, i, place, product);
-                        continue;
-                    }
-                    if (own > 0)
-                        product = add(product, POINT(held, i));
-                    SET_POINT(held, i, product);
+            HELD_LINES seen =
+                HELD_OR(held, n_mixed > 1 ? columns + IMAGE_SPECTRA(own, n_mixed) : held);
+            FOR_EACH_POINT(i, NY) {
+                const int place = PLACE_OF(i, NY);
+                cvec product =
+                    multiply_conjugate(POINT_OF_IMAGE(z, i), OTF_POINT(otf, i, 0, 1, place));
+                if (block == 0 && LANE_OF(i) == 0) {
+                    __global const real *edge = otf_edges + 2 * (image * NY + place);
+                    product =
+                        add_edge(product, edge[0], -edge[1], OPPOSITE(z, i, place, OVERSAMPLE));
                 }
+                if (own > 0 && n_mixed == 1)
+                    product = add(product, POINT(held, i));
+                SET_POINT(seen, i, product);
+            }
+            /* A pass of its own, which takes fewer registers. The last sky may share the image's array. */
+            for (int k = 0; k < (n_mixed > 1 ? n_mixed : 0); ++k) {
+                const real mix = mixes[image * n_skies + k];
+                if (mix != 0 || own == 0)
+                    add_to_sky(columns + (size_t)k * SPECTRA_SIZE, seen, mix, own > 0);
             }
             BARRIER;
         }

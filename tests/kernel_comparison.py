@@ -204,7 +204,7 @@ def _run_correlate_columns(harness: KernelHarness, given: SimpleNamespace) -> Pa
     expected = _real_edges(found)
     yield harness.take_spectra(out, given.k).reshape(expected.shape), expected
     others = harness.take_image_spectra(out, given.p)[1:]
-    if not np.array_equal(others, _real_edges(given.image_spectra[1:])):
+    if given.k == 1 and not np.array_equal(others, _real_edges(given.image_spectra[1:])):
         raise DeviceError("others than those of skies are written")
     out, first = harness.put_image_spectra(given.image_spectra), given.k - 1
     arguments = _put_otfs(harness, given)

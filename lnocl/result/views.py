@@ -10,7 +10,6 @@ from lnocl.core.runs.outcome import mean_over_epochs
 from lnocl.core.scene.arrays import Array
 from lnocl.core.scene.components import Mixing
 from lnocl.core.scene.detector import psfs_on_detector
-from lnocl.core.scene.forward_model import Model
 from lnocl.plotting.light_curves import light_curves
 from lnocl.plotting.result import ResultView
 from lnocl.result.summary import Unit
@@ -56,6 +55,8 @@ def noise_of(result: Result, electrons: float) -> Array:
     variances = []
     for part in estimate.parts:
         scene, models = part.estimate.scene, part.estimate.models()
+        from lnocl.core.scene.forward_model import Model  # which loads scipy
+
         model = Model(scene)
         pairs = zip(areas[list(part.images)], model.weights, models, strict=True)
         told = model.adjoint(

@@ -71,7 +71,7 @@ def test_the_programs_used_last_are_held(context, compiled):
 @pytest.mark.exhaustive
 def test_the_names_of_arguments_are_those_that_the_kernels_declare(context):
     arguments = Program(context, (128, 64), np.dtype(np.float32)).arguments
-    own = ["spectra", "pixels", "steps", "n_images", "row_roots", "scratch"]
+    own = ["spectra", "pixels", "steps", "n_images", "n_skies", "row_roots", "scratch"]
     assert list(arguments["rfft_rows"]) == own
     assert list(arguments["fft_columns"]) == ["spectra", "column_roots", "scratch"]
 
