@@ -15,6 +15,8 @@ KERNEL void rfft_rows(
     OF_MEMBER(pixels, (size_t)n_skies * PIXELS_SIZE);
     OF_MEMBER(steps, N_NUMBERS);
     FOR_EACH_BLOCK_IF(steps[GOING], unit, ROW_BLOCKS * n_skies) {
+        const int block = unit % ROW_BLOCKS;
+        __global vec *sky = SPECTRA_OF_SKY(spectra, unit);
         __global const vec *from = pixels + (size_t)unit * NX * 2 * SIDE;
         FOR_EACH(piece, INNER(NX) * SIDE) {
             const int x = piece / SIDE, lane = piece % SIDE;
@@ -26,7 +28,7 @@ KERNEL void rfft_rows(
         }
         BARRIER;
         dif_inner(z, NX, row_roots);
-        write_tiles(SPECTRA_OF_SKY(spectra, unit), z, unit % ROW_BLOCKS, 1);
+        write_tiles(sky, z, block, 1);
     }
 }
 
