@@ -474,3 +474,6 @@ def test_only_filters_whose_stars_lie_elsewhere_are_moved():
     np.testing.assert_allclose(moved, [[1.0, 0.0], [-0.05, 0.7]])
     near = [found[0], Mended(setup, away=np.array([0.25, 0.22]))]
     assert _in_one_place(setup, observation.mixing, near) is setup
+    # Where one was not moved the stars of both may lie elsewhere than they were given.
+    for one in ([found[0], Mended(setup)], [Mended(setup), found[1]]):
+        assert _in_one_place(setup, observation.mixing, one) is setup

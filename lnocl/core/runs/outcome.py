@@ -137,7 +137,8 @@ class Mended(NamedTuple):
     is_within : bool
         Whether they were judged, and are off by no more than their `psf_error` holds.
     away : ndarray of float64, shape (2,)
-        How far stars that are moved lie from where they were given, pixels, their mean by flux.
+        How far stars lie from where they were given, pixels, their mean by flux; NaN where they
+        were not moved, so that this is not known.
     """
 
     setup: Setup
@@ -145,7 +146,7 @@ class Mended(NamedTuple):
     near_stars: Array | None = None
     fits: bool = False
     is_within: bool = False
-    away: Array = np.zeros(2)
+    away: Array = np.full(2, np.nan)
 
 
 def mean_over_epochs(fluxes: Array, n_epochs: int) -> Array:

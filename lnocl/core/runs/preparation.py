@@ -125,7 +125,10 @@ def _mended(plan: Plan, setup: Setup, progress: bool) -> Mended:
 
 
 def _in_one_place(setup: Setup, mixing: Mixing, found: Sequence[Mended]) -> Setup:
-    """Return a setup with the images of filters moved to where those of the first see the stars."""
+    """Return a setup with the images of filters moved to where those of the first see the stars.
+
+    Only filters are compared whose stars were moved: else all of them may lie elsewhere than given.
+    """
     observation, moved = setup.observation, np.zeros((setup.observation.n_images, 2))
     for name, images, each in zip(mixing.filter_names, mixing.images, found, strict=True):
         away = each.away - found[0].away

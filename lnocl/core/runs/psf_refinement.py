@@ -94,10 +94,10 @@ class _State:
         return self.estimate.star_fluxes[: self.estimate.scene.n_stars]
 
     def away(self, runs: GuardedRuns) -> Array:
-        """Return how far stars lie from where they were given, their mean by flux, pixels."""
+        """Return that of `Mended`: how far stars lie from where they were given, if moved."""
         light = self.star_fluxes.reshape(len(self.places), -1).sum(axis=1)
-        if not light.sum():
-            return np.zeros(2)
+        if not (self.moves and light.sum()):
+            return np.full(2, np.nan)
         return np.asarray(np.average(self.places - runs.stars, axis=0, weights=light))
 
     def is_mended_by(self, other: _State) -> bool:
