@@ -462,18 +462,24 @@ def test_images_of_a_filter_are_moved_to_where_the_first_see_the_stars(by, log):
     assert not left._findings.observation.offsets.any()
 
 
-def test_only_filters_whose_stars_lie_elsewhere_are_moved():
+def test_only_filters_whose_stars_surely_lie_elsewhere_are_moved(monkeypatch):
+    from lnocl.core.runs import preparation
     from lnocl.core.runs.outcome import Mended
-    from lnocl.core.runs.preparation import _in_one_place
     from lnocl.core.runs.start import Setup
 
     observation = observe(offsets=[[1.0, 0.0], [0.0, 0.0]])
     setup = Setup(observation, np.array([STAR]), 0, "sgp", "single", "numpy", None)
-    found = [Mended(setup, away=np.array([0.3, 0.2])), Mended(setup, away=np.array([0.25, 0.9]))]
-    moved = _in_one_place(setup, observation.mixing, found).observation.offsets
-    np.testing.assert_allclose(moved, [[1.0, 0.0], [-0.05, 0.7]])
-    near = [found[0], Mended(setup, away=np.array([0.25, 0.22]))]
-    assert _in_one_place(setup, observation.mixing, near) is setup
-    # Where one was not moved the stars of both may lie elsewhere than they were given.
-    for one in ([found[0], Mended(setup)], [Mended(setup), found[1]]):
-        assert _in_one_place(setup, observation.mixing, one) is setup
+
+    def moved(*places):
+        measured = iter([(np.array(place), error) for *place, error in places])
+        monkeypatch.setattr(preparation, "_away", lambda _: next(measured))
+        found = [Mended(setup)] * len(places)
+        return preparation._in_one_place(setup, observation.mixing, found).observation.offsets
+
+    stays = observation.offsets
+    np.testing.assert_allclose(
+        moved((0.3, 0.2, 0.01), (0.25, 0.9, 0.01)), stays + np.array([[0.0, 0.0], [-0.05, 0.7]])
+    )
+    np.testing.assert_array_equal(moved((0.3, 0.2, 0.01), (0.25, 0.22, 0.001)), stays)
+    np.testing.assert_array_equal(moved((0.3, 0.2, 0.2), (0.25, 0.9, 0.01)), stays)
+    np.testing.assert_array_equal(moved((0.0, 0.0, np.inf), (0.25, 0.9, 0.01)), stays)

@@ -136,9 +136,10 @@ class Mended(NamedTuple):
         Whether the PSFs were judged, and no error is left that noise does not explain.
     is_within : bool
         Whether they were judged, and are off by no more than their `psf_error` holds.
-    away : ndarray of float64, shape (2,)
-        How far stars lie from where they were given, pixels, their mean by flux; NaN where they
-        were not moved, so that this is not known.
+    judged : Estimate or None
+        That of the window in which stars were moved; None where they were not.
+    given : ndarray of float64, shape (n, 2)
+        Where its stars were given.
     """
 
     setup: Setup
@@ -146,7 +147,8 @@ class Mended(NamedTuple):
     near_stars: Array | None = None
     fits: bool = False
     is_within: bool = False
-    away: Array = np.full(2, np.nan)
+    judged: Estimate | None = None
+    given: Array = np.zeros((0, 2))
 
 
 def mean_over_epochs(fluxes: Array, n_epochs: int) -> Array:

@@ -19,13 +19,13 @@ from lnocl.core.scene.components import Mixing
 from lnocl.core.scene.observation import Observation
 from lnocl.core.scene.penalty import Penalty, recommend_smoothings
 from lnocl.errors import NotFiniteError, detail, note, of_images
-from lnocl.process import ignored_notes
+from lnocl.process import ignored_notes, ignored_warnings
 from lnocl.progress import Progress
 
 # Of the smoothing that is recommended, from which held-out counts choose besides none.
 MULTIPLES = (1.0, 3.0, 10.0)
-# Pixels by which the stars of filters may lie apart.
-MISPLACED = 0.1
+# Pixels by which the stars of filters may lie apart, and standard errors.
+MISPLACED, SURELY = 0.1, 5.0
 # Filters of which each has lines of its own.
 MOST_TOLD = 4
 # Runs with wrong PSFs end where the objective falls by less than this share of itself.
@@ -110,36 +110,63 @@ def _mended(plan: Plan, setup: Setup, progress: bool) -> Mended:
                 setup = settle_levels(setup)
         return _judge_psfs(plan, setup, progress) if plan.does(PSFS) else Mended(setup)
     found, names = list[Mended](), mixing.filter_names
-    for g, which in enumerate(mixing.images):
-        own = replace(setup, observation=observation.of_images(which), initial_extended=None)
-        own = replace(own, initial_star_fluxes=None)
-        families = plan.families
-        if len(which) == 1 and not plan.is_asked:  # whose place is that of its stars
-            families = tuple(name for name in families if name != "shift")
-        quiet = ignored_notes() if g >= MOST_TOLD else nullcontext()
-        with of_images(which, names[g]), quiet:
-            found.append(_mended(replace(plan, setup=own, families=families), own, progress))
+    for g in range(len(names)):
+        found.append(_mended_filter(plan, setup, mixing, g, progress))
+    is_moved = [each.judged is not None for each in found]
+    if plan.mends and plan.moves and any(is_moved):
+        for g in np.flatnonzero(~np.array(is_moved)).tolist():  # whose places are to be compared
+            with ignored_notes(), ignored_warnings():
+                moved = _mended_filter(replace(plan, moves=True), setup, mixing, g, progress)
+            found[g] = found[g]._replace(judged=moved.judged, given=moved.given)
+        setup = _in_one_place(setup, mixing, found)
     if len(names) > MOST_TOLD:
         note(f"what was found for {len(names) - MOST_TOLD} other filters is in the result alone")
-    return _joined(_in_one_place(setup, mixing, found) if plan.mends else setup, mixing, found)
+    return _joined(setup, mixing, found)
+
+
+def _mended_filter(plan: Plan, setup: Setup, mixing: Mixing, g: int, progress: bool) -> Mended:
+    """Return the setup of the images of a filter, as `_mended` does."""
+    which, families = mixing.images[g], plan.families
+    own = replace(setup, observation=setup.observation.of_images(which), initial_extended=None)
+    own = replace(own, initial_star_fluxes=None)
+    if len(which) == 1 and not plan.is_asked:  # whose place is that of its stars
+        families = tuple(name for name in families if name != "shift")
+    quiet = ignored_notes() if g >= MOST_TOLD else nullcontext()
+    with of_images(which, mixing.filter_names[g]), quiet:
+        return _mended(replace(plan, setup=own, families=families), own, progress)
 
 
 def _in_one_place(setup: Setup, mixing: Mixing, found: Sequence[Mended]) -> Setup:
-    """Return a setup with the images of filters moved to where those of the first see the stars.
-
-    Only filters are compared whose stars were moved: else all of them may lie elsewhere than given.
-    """
+    """Return a setup with the images of filters moved to where those of the first see the stars."""
     observation, moved = setup.observation, np.zeros((setup.observation.n_images, 2))
-    for name, images, each in zip(mixing.filter_names, mixing.images, found, strict=True):
-        away = each.away - found[0].away
-        if np.hypot(*away) > MISPLACED:
-            moved[images] = observation.turns[images] @ away
-            x, y = away
+    places = list(map(_away, found))
+    for name, images, (away, error) in zip(mixing.filter_names, mixing.images, places, strict=True):
+        x, y = by = away - places[0][0]
+        if np.hypot(x, y) > max(MISPLACED, SURELY * float(np.hypot(error, places[0][1]))):
+            moved[images] = observation.turns[images] @ by
             note(
                 f"{name}: images moved by ({x:+.2f}, {y:+.2f}) pixels, by their stars "
                 "(`mend_images` False leaves them)"
             )
     return replace(setup, observation=observation.moved(moved)) if moved.any() else setup
+
+
+def _away(mended: Mended) -> tuple[Array, float]:
+    """Return how far stars lie from where they were given, pixels, and its standard error.
+
+    It is the mean by the inverse squares of errors; the error is infinite where none is known.
+    """
+    if mended.judged is None:
+        return np.zeros(2), np.inf
+    from lnocl.core.solvers.star_errors import standard_errors  # which loads scipy
+
+    scene = mended.judged.scene
+    errors = standard_errors(mended.judged, True)[0][:, 1:].max(axis=1)
+    weights = np.nan_to_num(errors**-2.0, posinf=0.0).reshape(len(scene.places), -1).sum(axis=1)
+    if not weights.sum():
+        return np.zeros(2), np.inf
+    mean = np.average(scene.places - mended.given, axis=0, weights=weights)
+    return np.asarray(mean), float(weights.sum() ** -0.5)
 
 
 def _joined(setup: Setup, mixing: Mixing, found: Sequence[Mended]) -> Mended:

@@ -93,13 +93,6 @@ class _State:
         """The fluxes of the stars, electrons."""
         return self.estimate.star_fluxes[: self.estimate.scene.n_stars]
 
-    def away(self, runs: GuardedRuns) -> Array:
-        """Return that of `Mended`: how far stars lie from where they were given, if moved."""
-        light = self.star_fluxes.reshape(len(self.places), -1).sum(axis=1)
-        if not (self.moves and light.sum()):
-            return np.full(2, np.nan)
-        return np.asarray(np.average(self.places - runs.stars, axis=0, weights=light))
-
     def is_mended_by(self, other: _State) -> bool:
         """Return whether other PSFs or positions mend enough to be taken."""
         before, after = self.misfit, other.misfit
@@ -192,8 +185,9 @@ def mend(runs: GuardedRuns, names: Sequence[str], moves: bool | str, is_asked: b
     allowance = Allowance(observation, runs, estimate, known)
     near_stars = allowance.near_stars(setup.pad)
     changed = replace(setup, observation=observation, refine_positions=state.moves)
+    places = state.estimate if state.moves else None, runs.stars
     if not (is_asked or len(known) or is_told):
-        return Mended(changed, None, near_stars, True, True, state.away(runs))
+        return Mended(changed, None, near_stars, True, True, *places)
     _tell(given, state, tried, done)
     if is_fitted and families.parameters[:2] == ["shift x", "shift y"]:
         _tell_places(values[:, :2] / families.units[:2])
@@ -218,7 +212,7 @@ def mend(runs: GuardedRuns, names: Sequence[str], moves: bool | str, is_asked: b
     if observation.psf_error and not is_within:  # the errors of stars hold what residuals show
         observation = observation.replace(psf_error=min(estimate.misfit.kappa, MOST_PSF_ERROR))
     changed = replace(changed, observation=observation)
-    return Mended(changed, refinement, near_stars, fits, is_within, state.away(runs))
+    return Mended(changed, refinement, near_stars, fits, is_within, *places)
 
 
 def _is_held(misfit: PsfMisfit, observation: Observation) -> bool:
