@@ -162,8 +162,8 @@ FAULTS = {
     "scratch read before it is written": (
         "an item a block",
         "correlate_columns",
-        "if (own > 0)\n                        product",
-        "if (own >= 0)\n                        product",
+        "if (own > 0 && n_mixed == 1)",
+        "if (own >= 0 && n_mixed == 1)",
         "Uninitialized value written to local memory",
     ),
     "padding read": (
