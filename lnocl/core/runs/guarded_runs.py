@@ -21,6 +21,7 @@ from scipy.ndimage import gaussian_filter
 from scipy.spatial import KDTree
 
 from lnocl.core.runs.halos import hold_halos, settle_halos
+from lnocl.core.runs.outcome import Outcome
 from lnocl.core.runs.psf_posterior import settle_psfs
 from lnocl.core.runs.run import Run
 from lnocl.core.runs.start import Setup, make_model, make_start
@@ -125,7 +126,7 @@ class GuardedRuns:
             setup, solver="sgp", pad=pad, initial_extended=None, initial_star_fluxes=None
         )
         self.penalty = Penalty(smoothing=STEADY * recommend_smoothing(self.observation))
-        self._steady = dict[tuple[int, bytes], tuple[Estimate, Psfs]]()
+        self._steady = dict[tuple[int, bytes], tuple[Outcome, Psfs]]()
 
     def beside(self, points: Array) -> GuardedRuns:
         """Return the runs with more stars, at places (n, 2) in the whole images."""
@@ -179,8 +180,8 @@ class GuardedRuns:
                     break
         return found
 
-    def steady(self, psfs: Psfs, stars: Array) -> Estimate:
-        """Return the estimate of a run with one weight, which is kept for the same PSFs and stars.
+    def steady(self, psfs: Psfs, stars: Array) -> Outcome:
+        """Return the outcome of a run with one weight, which is kept for the same PSFs and stars.
 
         Raises
         ------
@@ -189,7 +190,7 @@ class GuardedRuns:
         """
         key = id(psfs), stars.tobytes()
         if key not in self._steady:  # which holds the PSFs, lest others take their place in memory
-            found = steady_estimate(self.setup_of(psfs, stars), self.penalty, self._tick)
+            found = steady_outcome(self.setup_of(psfs, stars), self.penalty, self._tick)
             self._steady = {key: (found, psfs)}
         return self._steady[key][0]
 
@@ -200,18 +201,17 @@ class GuardedRuns:
         """
         setup = self.setup_of(psfs, stars)
 
-        def run(given: Setup) -> Estimate:
+        def run(given: Setup) -> Outcome:
             if given is setup:
                 return self.steady(psfs, stars)
-            return steady_estimate(given, self.penalty, self._tick)
+            return steady_outcome(given, self.penalty, self._tick)
 
-        steps, found = settle_psfs(setup, moves, run)
-        if not steps:
-            return psfs, stars
-        whole = self.whole.observation.replace(psfs=psfs)
-        for step in steps:
-            whole = with_errors(whole, step)
-        return whole.psfs_over_images, np.where(found == setup.stars, stars, found)
+        theta, found = settle_psfs(setup, moves, run)
+        stars = np.where(found == setup.stars, stars, found)
+        if theta.any():
+            whole = with_errors(self.whole.observation.replace(psfs=psfs), theta)
+            psfs = whole.psfs_over_images
+        return psfs, stars
 
     def _run(self, setup: Setup, found: Judged, n_iter: int, guard: float) -> Judged:
         """Return the estimate after a run that begins at `found`, with its misfit measured anew.
@@ -274,10 +274,8 @@ class GuardedRuns:
         return mapped(psfs, complete)
 
 
-def steady_estimate(
-    setup: Setup, penalty: Penalty, tick: Callable[[int], object] = int
-) -> Estimate:
-    """Return the estimate of a run with stars where they are given, and halos held.
+def steady_outcome(setup: Setup, penalty: Penalty, tick: Callable[[int], object] = int) -> Outcome:
+    """Return the outcome of a run with stars where they are given, and halos held.
 
     Raises
     ------
@@ -287,7 +285,7 @@ def steady_estimate(
     setup = replace(setup, solver="sgp", refine_positions=False)
     with ignored_warnings(), ignored_notes():
         start = settle_halos(make_start(setup, penalty))
-        return run_steadily(start, penalty, N_ITER, tick).estimate
+        return run_steadily(start, penalty, N_ITER, tick)
 
 
 def inside(stars: Array, observation: Observation) -> Array:

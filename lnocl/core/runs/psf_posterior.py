@@ -3,7 +3,8 @@ r"""PSFs as the images show them at their stars: the mean of what they may be.
 The least squares at a star (`lnocl.core.solvers.near_star`) have the errors theta of PSFs among
 their unknowns, beside the star and the extended source. Those of the brightest stars are solved
 together, with one theta. The estimate that they are of is that of a run with one weight of
-smoothing, which is made anew with the PSFs of theta, and theta then found again.
+smoothing, which is made anew with the PSFs of theta, and theta then found again, as long as the
+objective falls.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.linalg import block_diag
 
+from lnocl.core.runs.outcome import Outcome
 from lnocl.core.runs.start import Setup
 from lnocl.core.scene.arrays import Array
 from lnocl.core.scene.cores import fwhm
@@ -27,15 +29,17 @@ from lnocl.core.solvers.psf_errors import (
     NARROWEST,
     SHIFT,
     alike,
+    cost,
     count,
     with_errors,
 )
 from lnocl.errors import DivergedError, NotFiniteError
 from lnocl.process import ignored_notes, ignored_warnings
 
-# Rounds of a run and of a step, at most, and the longest step, and that after which none follows,
-# standard deviations of the prior: the third would be a third of it (docs/validation/psf_error.md).
-ROUNDS, MAX_STEP, SHORT = 3, 6.0, 0.3
+# Steps that are tried, at most, and the longest step, and that which no run follows, standard
+# deviations of the prior. Nothing is tried either after a step that lowers the objective by less
+# than this share of it.
+MOST_RUNS, MAX_STEP, SHORT, SETTLED = 6, 6.0, 0.3, 1e-3
 # What the `psf_error` of PSFs holds is an error of no more than so many times it.
 HELD = 2.0
 # The standard deviation of a place that is given, pixels.
@@ -44,10 +48,15 @@ AWAY = 1.0
 FINISHED = 1e-2
 
 
-def settle_psfs(
-    setup: Setup, moves: bool, run: Callable[[Setup], Estimate]
-) -> tuple[list[Array], Array]:
-    """Return steps of theta, shape (n_psfs, N_SHAPES) each, and the places of the stars.
+def settle_psfs(setup: Setup, moves: bool, run: Callable[[Setup], Outcome]) -> tuple[Array, Array]:
+    r"""Return theta, shape (n_psfs, N_SHAPES), and the places of the stars.
+
+    Each step is one towards the least of
+
+    .. math:: \min_{f, c} J(f, c; \theta) + \tfrac{1}{2} \theta^T C^{-1} \theta,
+
+    which a run with the PSFs of theta tells, and is halved where that would rise: a PSF and an
+    extended source that are both too sharp, or too smooth, take each other's part.
 
     Stars are moved that lie farther off than `HELD` times what a PSF may be shifted by. Other
     shifts are left to the positions, and zero points as they are given. So are wings: what is not
@@ -62,30 +71,42 @@ def settle_psfs(
     moves : bool
         Whether stars may be moved.
     run : callable
-        Returns the estimate of a run, `lnocl.core.runs.guarded_runs.steady_estimate`.
+        Returns the outcome of a run, `lnocl.core.runs.guarded_runs.steady_outcome`.
     """
-    theta, steps = np.zeros((count(setup.observation), N_SHAPES)), list[Array]()
-    of_psfs = dict(zip(alike(setup.observation).tolist(), setup.observation.psfs, strict=True))
+    observation, share, are_moved = setup.observation, 1.0, True
+    of_psfs = dict(zip(alike(observation).tolist(), observation.psfs, strict=True))
+    theta, stars = np.zeros((count(observation), N_SHAPES)), setup.stars
     is_sampled = np.array([fwhm(of_psfs[k]) >= NARROWEST for k in range(len(theta))])
     if not is_sampled.any():
-        return steps, setup.stars
+        return theta, stars
     with suppress(DivergedError, NotFiniteError), ignored_warnings(), ignored_notes():
-        for _ in range(ROUNDS):
-            estimate = run(setup)
-            found, away = _mean(estimate, theta, moves)
+        outcome = run(setup)
+        least, (found, away) = outcome.objectives[-1], _mean(outcome.estimate, theta, moves)
+        for _ in range(MOST_RUNS):
             step = np.where(is_sampled[:, None], found - theta, 0.0)
-            steps.append(step * MAX_STEP / max(float(abs(step).max()), MAX_STEP))
-            theta = theta + steps[-1]
-            setup = replace(
+            step *= min(share, MAX_STEP / max(float(abs(step).max()), MAX_STEP))
+            if abs(step).max() < SHORT:
+                return (theta + step, stars + away) if share == 1.0 else (theta, stars)
+            tried = replace(
                 setup,
-                stars=setup.stars + away,
-                observation=with_errors(setup.observation, steps[-1]),
-                initial_extended=np.maximum(estimate.observed_sky, 0.0),
-                initial_star_fluxes=estimate.star_fluxes[: estimate.scene.n_stars],
+                stars=stars + away,
+                observation=with_errors(observation, theta + step),
+                initial_extended=np.maximum(outcome.estimate.observed_sky, 0.0),
+                initial_star_fluxes=outcome.star_fluxes[: outcome.scene.n_stars],
             )
-            if abs(steps[-1]).max() < SHORT:
-                break
-    return steps, setup.stars
+            after = run(tried)
+            fall = least - after.objectives[-1] - cost(theta + step)
+            if fall <= 0 and away.any():  # as PSFs may be shifted in place of stars
+                away, are_moved = np.zeros_like(away), False
+            elif fall <= 0:
+                share /= 2.0
+            else:
+                outcome, theta, stars, least = after, theta + step, tried.stars, least - fall
+                if fall < SETTLED * least:
+                    break
+                found, away = _mean(outcome.estimate, theta, moves)
+                away = away if are_moved else np.zeros_like(away)
+    return theta, stars
 
 
 def _mean(estimate: Estimate, at: Array, moves: bool) -> tuple[Array, Array]:

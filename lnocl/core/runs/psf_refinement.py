@@ -233,7 +233,7 @@ def _beside_stars(runs: GuardedRuns) -> Array:
     if are_noisy(observation.psfs):
         psfs = mapped(psfs, lambda _, stack: without_noise(stack, observation.oversample))
     with suppress(DivergedError, NotFiniteError), ignored_warnings(), ignored_notes():
-        _, found = companions(runs.steady(psfs, runs.stars))
+        _, found = companions(runs.steady(psfs, runs.stars).estimate)
     places = runs.first + np.reshape([each.place for each in found], (-1, 2))
     if len(places):
         named = " ".join(f"({x:.4g}, {y:.4g})" for x, y in places)

@@ -23,7 +23,7 @@ from functools import partial
 import numpy as np
 import scipy.fft
 from numpy.typing import NDArray
-from scipy.ndimage import gaussian_filter
+from scipy.ndimage import affine_transform, gaussian_filter
 
 from lnocl.core.scene.arrays import Array
 from lnocl.core.scene.cores import fwhm
@@ -121,11 +121,22 @@ def count(observation: Observation) -> int:
     return int(alike(observation).max()) + 1
 
 
+def cost(theta: Array) -> float:
+    """Return half the square of theta, (n_psfs, n), over the covariance of its prior."""
+    return 0.5 * float(np.sum(theta * (_precision(len(theta)) @ theta)))
+
+
+def _precision(n_psfs: int) -> Array:
+    """Return the inverse of the covariance of one theta over PSFs."""
+    return np.asarray(np.linalg.inv((1.0 - ALIKE) * np.eye(n_psfs) + ALIKE))
+
+
 def with_errors(observation: Observation, theta: Array) -> Observation:
     """Return an observation whose PSFs have changes of shape, shape (n_psfs, N_SHAPES).
 
-    Blurs are convolutions, as `slopes_of` has them to first order alone. PSFs keep their light and
-    their places. What would be below 0 is 0.
+    They are stretched and then blurred, as `slopes_of` has it to first order: speckles far from the
+    middle move by more than their width. PSFs keep their light and their places. What would be
+    below 0 is 0.
     """
     numbers, error = alike(observation), observation.psf_error
 
@@ -133,15 +144,24 @@ def with_errors(observation: Observation, theta: Array) -> Observation:
         by_stretch, by_blur = theta[numbers[j]].reshape(2, 3)
         changed = stack.copy()
         for k, psf in enumerate(stack):
-            spectrum, stretches, blurs, _ = _spectra(psf, error)
-            spectrum = spectrum + np.einsum("k,kvu->vu", by_stretch, stretches)
-            blurred = spectrum * np.exp(np.einsum("k,kvu->vu", by_blur, blurs))
-            [changed[k]] = _from_spectra([blurred], psf)
+            spectrum, _, blurs, _ = _spectra(_stretched(psf, error * by_stretch), error)
+            [changed[k]] = _from_spectra([spectrum * np.exp(np.tensordot(by_blur, blurs, 1))], psf)
         changed = np.where(stack < 0, changed, changed.clip(0.0))
         light = stack.sum(axis=(1, 2), keepdims=True)
         return changed * light / changed.sum(axis=(1, 2), keepdims=True)
 
     return observation.replace(psfs=mapped(observation.psfs_over_images, change))
+
+
+def _stretched(psf: Array, by: Array) -> Array:
+    """Return a PSF that is wider by shares along x, across, and along y, by quintic splines."""
+    if not by.any():
+        return psf
+    wider = np.array([[1.0 + by[2], by[1]], [by[1], 1.0 + by[0]]])
+    middle = np.array(psf.shape) // 2
+    back = np.linalg.inv(wider)
+    # Beyond the file its edge goes on.
+    return np.asarray(affine_transform(psf, back, middle - back @ middle, order=5, mode="nearest"))
 
 
 class PsfErrors:
@@ -170,10 +190,8 @@ class PsfErrors:
         self._is_one_of_several = np.bincount(epochs)[epochs] > 1
         self._zero_points = n - 1 + np.cumsum(self._is_one_of_several)
         self.n = n + int(self._is_one_of_several.sum())
-        n_psfs = count(observation)
-        among = np.linalg.inv((1.0 - ALIKE) * np.eye(n_psfs) + ALIKE)
         self.prior = np.eye(self.n)
-        self.prior[:n, :n] = np.kron(among, np.eye(N_SLOPES))
+        self.prior[:n, :n] = np.kron(_precision(count(observation)), np.eye(N_SLOPES))
         for epoch in np.unique(epochs[self._is_one_of_several]):
             of_epoch = self._zero_points[epochs == epoch]
             self.prior[np.ix_(of_epoch, of_epoch)] += COMMON**-2
