@@ -181,6 +181,7 @@ def _write(
     quantities = found.to_table(frames.electrons, frames.unit)
     quantities["name"] = [name.strip() for name in quantities["name"]]
     measured = quantities[[each.at is None for each in found.quantities]]
+    ratios = {"RATIO": found.ratio_map, "RATIOERR": found.ratio_error_map}
     write_errors(
         again.saved,
         quantities,
@@ -190,6 +191,7 @@ def _write(
             "ERROR": found.error_map / frames.electrons,
             "BIAS": found.bias_map / frames.electrons,
             "SHARE": found.share_map,
+            **(ratios if len(found.ratio_map) else {}),
         },
         [
             ("NREPL", found.n, "replicas"),

@@ -73,6 +73,9 @@ PARTS = {
     "ERROR": Part(pixels="f8", place=SKY, unit=LIGHT),
     "BIAS": Part(pixels="f8", place=SKY, unit=LIGHT),
     "SHARE": Part(pixels="f8", place=SKY),
+    # Of components, each other over the continuum, and its standard error.
+    "RATIO": Part(pixels="f8", place=SKY),
+    "RATIOERR": Part(pixels="f8", place=SKY),
     "REPLICAS": Part(("replica",)),
     "REPLSUMS": Part(pixels="f8"),
     # Sources and the map of signal-to-noise; curves of limits and their maps.

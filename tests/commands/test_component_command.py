@@ -103,6 +103,9 @@ def test_errors_of_regions_are_of_each_component_and_their_ratio(result, capsys)
     assert re.fullmatch(r".* knot: -?[\d.]+ \+- [\d.]+ \(-?[\d.]+ to -?[\d.]+\)", lines[3])
     with fits.open("out.fits") as hdus:
         assert [hdus[name].data.shape for name in ("ERROR", "BIAS", "SHARE")] == [(2, N, N)] * 3
+        ratio, error = hdus["RATIO"].data, hdus["RATIOERR"].data
+        assert ratio.shape == error.shape == (1, N, N)
+        assert (error[np.isfinite(ratio)] > 0).all()
         regions = hdus["REGIONS"].data
         assert regions["unit"].tolist() == ["electron", "electron", ""]
         np.testing.assert_allclose(regions["x"], 8.0)

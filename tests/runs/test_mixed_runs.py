@@ -8,6 +8,7 @@ import pytest
 from astropy.nddata import CCDData
 from astropy.wcs import WCS
 from scenes import paper
+from scipy.ndimage import gaussian_filter
 
 import lnocl
 from lnocl.core.runs.assessment import assess
@@ -209,6 +210,21 @@ def test_replicas_measure_each_component_and_how_bright_it_is_over_the_continuum
     np.testing.assert_allclose(found.shares[4], of_star / values[3])
     truth = regions[0].to_mask("exact").multiply(LINE).sum()
     assert abs(values[2] - truth) < 3 * errors[2]
+
+
+def test_the_map_of_line_over_continuum_has_the_scatter_of_replicas():
+    found, outcome = result().bootstrap(10), result()._findings
+
+    def smooth(skies):
+        return [gaussian_filter(sky, found.resolution / 2.3548, mode="nearest") for sky in skies]
+
+    line, continuum = smooth(result().extended)
+    np.testing.assert_allclose(found.ratio_map, [line / continuum], rtol=1e-4)
+    drawn = Replicas(outcome, 0, 10).reconstruct(*range(10))
+    changes = np.array([smooth(each.found.extended - each.drawn.extended) for each in drawn])
+    scatter = (changes[:, 0] - line / continuum * changes[:, 1]).std(axis=0, ddof=1)
+    np.testing.assert_allclose(found.ratio_error_map, [scatter / continuum], rtol=1e-3)
+    assert found.error_map.shape == found.bias_map.shape == found.share_map.shape == (2, *SHAPE)
 
 
 def test_errors_begin_with_what_a_file_holds():

@@ -16,6 +16,7 @@ from lnocl.core.runs.outcome import Outcome
 from lnocl.core.runs.quantities import (
     Part,
     Quantity,
+    compared,
     in_electrons,
     measure,
     measure_part,
@@ -67,9 +68,10 @@ class Bootstrap:
         their scatter is known.
     of_psfs : ndarray of float64, shape (n, k) or (0, k)
         The part of the errors that comes from PSFs; of length 0 where their scatter is not known.
-    sums : ndarray of float64, shape (3, ny, nx)
+    sums : ndarray of float64, shape (3, ny, nx) or (3, K + m, ny, nx)
         The sums over replicas of the errors of the extended source and of their squares, electrons
         per pixel, smoothed to the resolution; and the number of replicas in which there is light.
+        Those of K components are followed by those of m ratios.
     resolution : float
         Full width at half maximum of that smoothing, pixels: the resolution of all images together.
     seed : int
@@ -85,6 +87,8 @@ class Bootstrap:
     of_smoothing : ndarray of float64, shape (k,)
         The light of each region less that by as many iterations without smoothing, electrons; 0
         for all else.
+    ratio_map : ndarray of float64, shape (m, ny, nx)
+        Of components, one of which is called continuum, each other over that, at the resolution.
 
     See Also
     --------
@@ -122,6 +126,7 @@ class Bootstrap:
     stated: Array = field(default_factory=lambda: np.zeros(0))
     shares: Array = field(default_factory=lambda: np.zeros((1, 0)))
     of_smoothing: Array | float = 0.0
+    ratio_map: Array = field(default_factory=lambda: np.zeros(0))
 
     @property
     def n(self) -> int:
@@ -215,18 +220,31 @@ class Bootstrap:
     @property
     def share_map(self) -> Array:
         """The share of replicas in which each pixel has light, at the resolution."""
-        return np.asarray(self.sums[2] / self.n)
+        return np.asarray(self._of_skies(self.sums[2]) / self.n)
 
     @property
     def bias_map(self) -> Array:
         """Mean error of the extended source, electrons per pixel, at the resolution."""
-        return np.asarray(self.sums[0] / self.n)
+        return np.asarray(self._of_skies(self.sums[0]) / self.n)
 
     @property
     def error_map(self) -> Array:
         """Standard error of the extended source, electrons per pixel, at the resolution."""
+        return self._of_skies(self._deviations)
+
+    @property
+    def ratio_error_map(self) -> Array:
+        """Standard error of ``ratio_map``, to first order in those of both components."""
+        return np.asarray(self._deviations[len(self._of_skies(self._deviations)) :])
+
+    @property
+    def _deviations(self) -> Array:
         squares = self.sums[1] - self.sums[0] ** 2 / self.n
         return np.sqrt(np.maximum(squares, 0.0) / (self.n - 1))
+
+    def _of_skies(self, planes: Array) -> Array:
+        """Return the planes of the extended source, without those of ratios."""
+        return planes[: len(planes) - len(self.ratio_map)]
 
     def to_table(self, electrons: float = 1.0, unit: str | None = None) -> QTable:
         """Return a table with a row for each quantity.
@@ -353,10 +371,12 @@ def without_replicas(outcome: Outcome, parts: Sequence[Part], seed: int) -> Boot
     errors, is_shown = outcome.star_errors(), outcome.scene.is_shown[: outcome.scene.n_stars]
     positions = errors.positions[is_shown & outcome.moves].ravel()
     stated = np.nan_to_num(np.append(in_electrons(outcome, errors.fluxes), positions))
-    pixels = np.zeros((3, *outcome.scene.observation.skies_shape))
+    maps = _Maps(outcome, width)
+    pixels = np.zeros((3, *maps.answer.shape))
     none = np.zeros((0, len(quantities)))
     unit = "electron/s" if outcome.setup.is_rate else "electron"
-    return Bootstrap(quantities, none, none, pixels, width, seed, unit, stated, shares)
+    known = width, seed, unit, stated, shares
+    return Bootstrap(quantities, none, none, pixels, *known, ratio_map=maps.ratios)
 
 
 def _changed_by_smoothing(outcome: Outcome, parts: Sequence[Part], values: Array) -> Array:
@@ -396,6 +416,41 @@ def _together(outcome: Outcome) -> int:
     return min(max(BATCH_PIXELS // pixels, 1), MOST_TOGETHER) if is_batch else 1
 
 
+class _Maps:
+    """The extended source at the resolution and, of components, each over the continuum.
+
+    Attributes
+    ----------
+    answer : ndarray of float64, shape (ny, nx) or (K + m, ny, nx)
+        The extended source, and the ratios.
+    ratios : ndarray of float64, shape (m, ny, nx)
+        These; NaN where there is no continuum.
+    """
+
+    def __init__(self, outcome: Outcome, width: float) -> None:
+        self._width, self._pairs = width, compared(outcome.scene.observation.component_names)
+        self.answer, self.ratios = self._smooth(outcome.estimate.observed_sky), np.zeros(0)
+        if self._pairs:
+            k, m = np.transpose(self._pairs)
+            self._below = np.where(self.answer > 0, self.answer, np.nan)[m]
+            self.ratios = self.answer[k] / self._below
+            self.answer = np.concatenate([self.answer, self.ratios])
+
+    def error(self, error: Array) -> Array:
+        """Return an error of the extended source like `answer`, that of ratios to first order."""
+        smooth = self._smooth(error)
+        if not self._pairs:
+            return smooth
+        k, m = np.transpose(self._pairs)
+        return np.concatenate([smooth, (smooth[k] - self.ratios * smooth[m]) / self._below])
+
+    def _smooth(self, sky: Array) -> Array:
+        from scipy.ndimage import gaussian_filter
+
+        widths = [0.0] * (sky.ndim - 2) + [self._width / FWHM] * 2
+        return np.asarray(gaussian_filter(sky, widths, mode="nearest"))
+
+
 class _Measured(NamedTuple):
     """What a replica adds to the arrays of `Bootstrap` of these names."""
 
@@ -410,16 +465,8 @@ class _Measuring:
     def __init__(
         self, outcome: Outcome, parts: Sequence[Part], seed: int, width: float, size: int
     ) -> None:
-        self._outcome, self._parts, self._width = outcome, parts, width
-        self._replicas = Replicas(outcome, seed, size)
-        self._smooth_answer = self._smooth(outcome.estimate.observed_sky)
-
-    def _smooth(self, sky: Array) -> Array:
-        """Return a sky at the resolution."""
-        from scipy.ndimage import gaussian_filter
-
-        widths = [0.0] * (sky.ndim - 2) + [self._width / FWHM] * 2
-        return np.asarray(gaussian_filter(sky, widths, mode="nearest"))
+        self._outcome, self._parts = outcome, parts
+        self._replicas, self._maps = Replicas(outcome, seed, size), _Maps(outcome, width)
 
     def __call__(self, numbers: Sequence[int]) -> list[_Measured]:
         return list(map(self._measure, self._replicas.reconstruct(*numbers)))
@@ -431,9 +478,9 @@ class _Measuring:
             last = replica.found_with_psfs
             of_psfs = (measure(self._outcome, last, self._parts) - seen)[None]
             seen = seen + of_psfs[0]
-        smooth = self._smooth(last.extended - replica.drawn.extended)
+        error = self._maps.error(last.extended - replica.drawn.extended)
         # There is light where the answer is brighter than the error.
-        sums = np.array([smooth, smooth**2, self._smooth_answer > smooth])
+        sums = np.array([error, error**2, self._maps.answer > error])
         return _Measured((seen - drawn)[None], of_psfs, sums)
 
 

@@ -90,10 +90,13 @@ def propagate(errors: Array, values: Array, parts: Sequence[Part], names: Sequen
 
 def _compared(part: Part, names: Sequence[str]) -> list[tuple[int, int]]:
     """Return which components' light in a region is divided by which: all by the continuum's."""
-    if isinstance(part, Profile) or CONTINUUM not in names:
-        return []
-    m = names.index(CONTINUUM)
-    return [(k, m) for k in range(len(names)) if k != m]
+    return [] if isinstance(part, Profile) else compared(names)
+
+
+def compared(names: Sequence[str]) -> list[tuple[int, int]]:
+    """Return which components are divided by which: all others by the continuum, if one is."""
+    m = names.index(CONTINUUM) if CONTINUUM in names else -1
+    return [(k, m) for k in range(len(names)) if k != m and m >= 0]
 
 
 def in_electrons(outcome: Outcome, fluxes: Array) -> Array:
