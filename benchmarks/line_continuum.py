@@ -157,9 +157,8 @@ def main():
     parser.add_argument("--replicas", type=int, default=0)
     args = parser.parse_args()
     warnings.simplefilter("ignore")
-    print(
-        "contrast images wrong   one  after before  known  of after  of before  seconds   within  rms"
-    )
+    print("contrast images wrong   one  after before  known", end="")
+    print("  of after  of before  seconds   within  rms")
     for contrast in args.contrasts:
         for n in args.images:
             for wrong in args.wrong:
