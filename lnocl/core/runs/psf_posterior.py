@@ -37,9 +37,8 @@ from lnocl.errors import DivergedError, NotFiniteError
 from lnocl.process import ignored_notes, ignored_warnings
 
 # Steps that are tried, at most, and the longest step, and that which no run follows, standard
-# deviations of the prior. Nothing is tried either after a step that lowers the objective by less
-# than this share of it.
-MOST_RUNS, MAX_STEP, SHORT, SETTLED = 6, 6.0, 0.3, 1e-3
+# deviations of the prior.
+MOST_RUNS, MAX_STEP, SHORT = 6, 6.0, 0.3
 # What the `psf_error` of PSFs holds is an error of no more than so many times it.
 HELD = 2.0
 # The standard deviation of a place that is given, pixels.
@@ -56,7 +55,9 @@ def settle_psfs(setup: Setup, moves: bool, run: Callable[[Setup], Outcome]) -> t
     .. math:: \min_{f, c} J(f, c; \theta) + \tfrac{1}{2} \theta^T C^{-1} \theta,
 
     which a run with the PSFs of theta tells, and is halved where that would rise: a PSF and an
-    extended source that are both too sharp, or too smooth, take each other's part.
+    extended source that are both too sharp, or too smooth, take each other's part. After a step
+    that lowers it by less than its noise, about its root, further ones would hand the light of
+    stars to the extended source.
 
     Stars are moved that lie farther off than `HELD` times what a PSF may be shifted by. Other
     shifts are left to the positions, and zero points as they are given. So are wings: what is not
@@ -102,7 +103,7 @@ def settle_psfs(setup: Setup, moves: bool, run: Callable[[Setup], Outcome]) -> t
                 share /= 2.0
             else:
                 outcome, theta, stars, least = after, theta + step, tried.stars, least - fall
-                if fall < SETTLED * least:
+                if fall < np.sqrt(least):  # the noise of the objective of as many pixels
                     break
                 found, away = _mean(outcome.estimate, theta, moves)
                 away = away if are_moved else np.zeros_like(away)
