@@ -55,6 +55,7 @@ LOOSE = 2.0
 # Of PSFs that are left wrong by more than this it is warned; of those whose pixels were fitted, by
 # more than `FIRST_ERROR`.
 NOTABLE = 0.03
+FOREIGN = "see whether they are of these images, and sampled alike"
 # Of more stars in the window the least squares would take more memory than the run.
 MOST_STARS = 64
 # A step is halved so often, at most, until no OTF exceeds its value at frequency 0.
@@ -399,7 +400,13 @@ def _tell_widths(observation: Observation, psfs: Psfs) -> None:
     """Say in a line how wide PSFs are that were fitted to the stars, over those given."""
     widths = 100.0 * _widened(observation, psfs)
     words = " to ".join(dict.fromkeys(f"{width:+.1f}" for width in (min(widths), max(widths))))
-    note(f"PSFs fitted to the stars: {words} % in width (`psf_error` 0 leaves them)")
+    if max(abs(widths)) > 100.0 * FIRST_ERROR:
+        warn(
+            f"the PSFs given do not fit the stars, by {words} % in width, and were fitted there: "
+            f"{FOREIGN}"
+        )
+    else:
+        note(f"PSFs fitted to the stars: {words} % in width (`psf_error` 0 leaves them)")
 
 
 def _tell_places(shifts: Array) -> None:
@@ -437,11 +444,7 @@ def _warn(refinement: PsfRefinement, setup: Setup) -> None:
     if refinement.has_free_pixels and refinement.psf_error > FIRST_ERROR:
         warn(
             f"the PSFs given do not fit the stars, by {100 * refinement.psf_error:.0f} %, and "
-            "their pixels were fitted there: "
-            + (
-                name_faults(setup.observation, seen)
-                or "see whether they are of these images, and sampled alike"
-            )
+            "their pixels were fitted there: " + (name_faults(setup.observation, seen) or FOREIGN)
         )
     if not refinement.has_free_pixels and refinement.psf_error > NOTABLE:
         are_exact = "" if setup.observation.psf_error else ", or leave `psf_error` 0 out"
