@@ -38,7 +38,8 @@ def test_turns_are_named_with_their_image(name):
 def test_a_pedestal_is_named_with_its_share():
     said = name_faults(observe(psf_of() + 0.05 / 0.95 / 41**2, n=1), STARS)
     assert said == (
-        "`psfs[0]` has a pedestal of 5 % of its light, level to its border: take that off"
+        "`psfs[0]` has a pedestal of 5 % of its light, level to its border: take that off, "
+        "unless it is a halo"
     )
 
 

@@ -76,7 +76,7 @@ def name_faults(observation: Observation, stars: Array) -> str:
         if edge.level > max(PEDESTAL, CLEAR * edge.level_error):
             return (
                 f"`psfs[{j}]` has a pedestal of {100 * edge.level:.2g} % of its light, level to "
-                "its border: take that off"
+                "its border: take that off, unless it is a halo"
             )
     return ""
 
