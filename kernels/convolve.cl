@@ -123,7 +123,7 @@ INLINE void take_sky(LINES lines, __global const vec *sky)
     BARRIER;
 }
 
-/* sky <- mix lines, added where that has begun. */
+/* sky <- mix lines, or sky + mix lines where has_begun. */
 INLINE void add_to_sky(
     __global vec *sky, const HELD_LINES lines, const real mix, const bool has_begun)
 {

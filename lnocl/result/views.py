@@ -49,14 +49,14 @@ def noise_of(result: Result, electrons: float) -> Array:
 
     .. math:: \sum_g U_{kg}^2 \Big/ \sum_{j \in g} A_j^T \frac{e_j}{m_j \sum K_j^2}.
     """
+    from lnocl.core.scene.forward_model import Model  # which loads scipy
+
     estimate, observation = result._outcome.estimate, result._observation
     ny, nx = observation.sky_shape
     areas = 1.0 / (psfs_on_detector(observation) ** 2).sum(axis=(1, 2))
     variances = []
     for part in estimate.parts:
         scene, models = part.estimate.scene, part.estimate.models()
-        from lnocl.core.scene.forward_model import Model  # which loads scipy
-
         model = Model(scene)
         pairs = zip(areas[list(part.images)], model.weights, models, strict=True)
         told = model.adjoint(

@@ -5,7 +5,8 @@ from functools import partial
 
 import numpy as np
 import pytest
-from scipy.ndimage import gaussian_filter
+from scipy.ndimage import affine_transform, gaussian_filter
+from scipy.signal import fftconvolve
 
 import lnocl
 from lnocl.core.runs import psf_posterior, psf_refinement
@@ -245,3 +246,64 @@ def test_misfit_beyond_the_psf_error_fits_parameters_and_raises_the_error(error,
     assert bool(found.refinement.parameters) != is_within
     raised = error if is_within else found.refinement.psf_error
     assert found.setup.observation.psf_error == pytest.approx(raised)
+
+
+def speckled(seed):
+    """Return a PSF with a core and a halo of speckles, which reaches over the frame."""
+    y, x = np.indices((64, 64)) - 32
+    rng = np.random.default_rng(seed)
+    speckles = gaussian_filter(rng.exponential(1.0, (64, 64)) ** 2, 1.3)
+    values = 0.7 * psf(3.6, 64) + 0.3 * speckles / speckles.sum()
+    return values * np.exp(-np.hypot(x, y) / 40.0)
+
+
+def nebula_round_a_star(wrong):
+    """Return images whose sky is brightest at the star, seen through PSFs, and these, too wide."""
+    y, x = np.indices((64, 64)) - np.reshape((30, 33), (2, 1, 1))
+    sky = (np.hypot(x, y) + 3.0) ** -1.5 * (1.2 + np.cos(np.arctan2(y, x + 2.0) - 2.0)) ** 2
+    sky *= 5e5 / sky.sum()
+    sky[30, 33] += 5e5
+    psfs = np.array([each / each.sum() for each in map(speckled, range(2))])
+    light = [fftconvolve(sky, each)[32:96, 32:96] for each in psfs]
+    images = np.random.default_rng(4).poisson(np.clip(light, 0, None) + 30.0)
+    given = [
+        affine_transform(each, np.eye(2) / (1 + wrong), 32 - 32 / (1 + wrong), order=5)
+        for each in psfs
+    ]
+    known = {"background": 30.0, "psf_error": 0.03}
+    return psfs, lnocl.Observation(images, np.clip(given, 0, None), **known)
+
+
+@pytest.mark.exhaustive
+@pytest.mark.parametrize(("wrong", "share"), [(0.02, 0.4), (-0.03, 0.3)])
+def test_steps_lead_to_the_psf_where_the_sky_is_brightest_at_the_star(wrong, share):
+    """Its speckles are moved by half their width, which the derivatives do not hold."""
+    true, observation = nebula_round_a_star(wrong)
+    setup = setup_of(observation, [(33, 30)])
+    penalty = Penalty(smoothing=3 * recommend_smoothing(observation))
+    theta, _ = psf_posterior.settle_psfs(setup, False, partial(steady_outcome, penalty=penalty))
+    found = with_errors(observation, theta).psfs
+    before, after = (abs(each - true).sum() for each in (observation.psfs, found))
+    assert after < share * before
+
+
+def test_steps_are_halved_and_stars_stay_first_where_images_fit_worse(monkeypatch):
+    """PSFs are right and the star is where it is given: whatever is found is to be refused."""
+    tried = []
+
+    def run(setup, penalty):
+        tried.append((setup.stars[0, 0] - STAR[0], fwhm(setup.observation.psfs[0])))
+        return steady_outcome(setup, penalty)
+
+    found = np.full((1, 6), 4.0)
+    monkeypatch.setattr(psf_posterior, "_mean", lambda *_: (found, np.array([[0.3, 0.0]])))
+    observation = observe(TRUE[:1], TRUE[:1], exposure=DEPTHS[:1], psf_error=0.03)
+    penalty = Penalty(smoothing=3 * recommend_smoothing(observation))
+    theta, places = psf_posterior.settle_psfs(
+        setup_of(observation), True, partial(run, penalty=penalty)
+    )
+    moved, widths = np.transpose(tried)
+    np.testing.assert_allclose(moved, [0.0, 0.3, *[0.0] * (len(tried) - 2)])
+    assert widths[1] == widths[2] > widths[3] > widths[4] > widths[0]
+    assert not theta.any()
+    np.testing.assert_array_equal(places, [STAR])

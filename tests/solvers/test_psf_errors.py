@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.linalg import expm
 
 import lnocl
 from lnocl.core.scene.estimate import Estimate
@@ -118,7 +119,7 @@ def test_stretches_are_of_the_whole_psf(shape):
             for a, x0, y0 in ((1.0, 0, 0), (0.3, 26, -5), (0.2, -20, 24))
         )
 
-    back = np.linalg.inv([[1 + along, across], [across, 1 + up]])
+    back = expm([[-along, -across], [-across, -up]])
     expected = speckles(back[0, 0] * x + back[0, 1] * y, back[1, 0] * x + back[1, 1] * y)
     observation = lnocl.Observation(
         np.ones((1, 96, 96)), speckles(x, y), psf_centre="given", psf_error=ERROR
@@ -126,6 +127,18 @@ def test_stretches_are_of_the_whole_psf(shape):
     theta = np.array([[along, across, up, 0, 0, 0]]) / ERROR
     found = with_errors(observation, theta).psfs[0]
     np.testing.assert_allclose(found, expected / expected.sum(), rtol=0, atol=2e-3 * found.max())
+
+
+def test_no_stretch_turns_a_psf_over():
+    """By more than its width, too: what is narrower stays on its own side of the middle."""
+    psf = lopsided(6.0, 61)
+    observation = lnocl.Observation(np.ones((1, 64, 64)), psf, psf_centre="given", psf_error=0.3)
+    found = with_errors(observation, np.array([[-4.0, 0, 2.0, 0, 0, 0]])).psfs[0]
+    assert np.isfinite(found).all()
+    assert found.sum() == pytest.approx(1.0)
+    sides = [each[:, 31:].sum() - each[:, :30].sum() for each in (psf, found)]
+    assert sides[0] > 0.01
+    assert sides[1] > 0.01
 
 
 def test_small_stretches_are_their_derivatives():

@@ -97,16 +97,16 @@ def settle_psfs(setup: Setup, moves: bool, run: Callable[[Setup], Outcome]) -> t
             )
             after = run(tried)
             fall = least - after.objectives[-1] - cost(theta + step)
-            if fall <= 0 and away.any():  # as PSFs may be shifted in place of stars
-                away, are_moved = np.zeros_like(away), False
-            elif fall <= 0:
-                share /= 2.0
-            else:
+            if fall > 0:
                 outcome, theta, stars, least = after, theta + step, tried.stars, least - fall
                 if fall < np.sqrt(least):  # the noise of the objective of as many pixels
                     break
                 found, away = _mean(outcome.estimate, theta, moves)
                 away = away if are_moved else np.zeros_like(away)
+            elif away.any():  # as PSFs may be shifted in place of stars
+                away, are_moved = np.zeros_like(away), False
+            else:
+                share /= 2.0
     return theta, stars
 
 

@@ -55,6 +55,7 @@ LOOSE = 2.0
 # Of PSFs that are left wrong by more than this it is warned; of those whose pixels were fitted, by
 # more than `FIRST_ERROR`.
 NOTABLE = 0.03
+# What to do about them.
 FOREIGN = "see whether they are of these images, and sampled alike"
 # Of more stars in the window the least squares would take more memory than the run.
 MOST_STARS = 64

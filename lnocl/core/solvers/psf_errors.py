@@ -23,6 +23,7 @@ from functools import partial
 import numpy as np
 import scipy.fft
 from numpy.typing import NDArray
+from scipy.linalg import expm
 from scipy.ndimage import affine_transform, gaussian_filter
 
 from lnocl.core.scene.arrays import Array
@@ -154,13 +155,15 @@ def with_errors(observation: Observation, theta: Array) -> Observation:
 
 
 def _stretched(psf: Array, by: Array) -> Array:
-    """Return a PSF that is wider by shares along x, across, and along y, by quintic splines."""
+    """Return a PSF that is wider by shares along x, across, and along y, by quintic splines.
+
+    The map is the exponential of these shares, so that none turns a PSF over.
+    """
     if not by.any():
         return psf
-    wider = np.array([[1.0 + by[2], by[1]], [by[1], 1.0 + by[0]]])
     middle = np.array(psf.shape) // 2
-    back = np.linalg.inv(wider)
-    # Beyond the file its edge goes on.
+    back = expm(-np.array([[by[2], by[1]], [by[1], by[0]]]))
+    # Beyond the file the values at its edge are repeated.
     return np.asarray(affine_transform(psf, back, middle - back @ middle, order=5, mode="nearest"))
 
 
