@@ -84,6 +84,14 @@ class TestExposures:
         assert lnocl.plan(given, stars[:2]).why_not(EXPOSURES) == why
         assert lnocl.plan(given, stars).does(EXPOSURES)
 
+    def test_filters_of_one_image_each_tell_no_exposures(self):
+        """A star has a flux in each filter, as it has in each epoch, but does not vary in one."""
+        weights = {"line": [1, 0, 0], "continuum": [1, 1, 0.7]}
+        alone = lnocl.plan(dimmed(components=weights), [STAR])
+        assert alone.why_not(EXPOSURES) == "there is one image of each filter"
+        weights["continuum"][2] = 1
+        assert lnocl.plan(dimmed(components=weights), [STAR]).does(EXPOSURES)
+
     def test_halos_may_be_taken_for_the_light_of_stars(self):
         halo = lopsided(*STAR, SIZE)
         plan = lnocl.plan(dimmed(halos=[halo]), [STAR])

@@ -96,6 +96,26 @@ def test_images_of_several_epochs_need_three_stars():
     assert zero_points(Scene(observe(epochs=(0, 0, 0)), STARS)) is not None
 
 
+@pytest.mark.parametrize("factors", [[0.6, 1.0, 1.3, 1.3], [0.6, 1.0, 0.7 * 0.6, 1.0]])
+def test_images_are_compared_with_those_of_their_own_filter(factors):
+    """A filter in which all stars are fainter is no cloud."""
+    stars = np.array([(20.2, 22.0), (50.7, 31.4), (79.3, 40.1)])
+    alone = sum(lopsided(*at, (64, 100)) for at in stars)
+    images = [np.random.default_rng(3).poisson(LEVEL + 5e4 * each * alone) for each in factors]
+    weights = {"line": [1, 0, 1, 0], "continuum": [1, 1, 1, 1]}
+    psf = lopsided(20, 20, (41, 41))
+    observation = lnocl.Observation(images, psf, background=LEVEL, components=weights)
+    found = zero_points(Scene(observation, stars))
+    brighter = np.tile(np.reshape(factors, (2, 2)).max(axis=0), 2)
+    told = np.log(factors / brighter)
+    assert found.n_stars == 3
+    np.testing.assert_allclose(found.values, told, atol=0.01)
+    alike = observation.replace(images=np.array(images)[[0, 1, 0, 1]])
+    assert zero_points(Scene(alike, stars)) is None
+    two = lnocl.Observation(images[:2], psf, background=LEVEL, components={"a": [1, 0], "b": 1})
+    assert zero_points(Scene(two, stars)) is None
+
+
 @pytest.mark.parametrize("seed", range(10))
 def test_chance_agreement_of_three_variable_stars_gives_no_zero_points(seed):
     """By a tenth in each of twelve nights; most such scenes had one, and 100 nights two."""

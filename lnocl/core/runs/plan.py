@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal, NamedTuple
@@ -52,14 +53,14 @@ AUTO = Condition(lambda plan: plan.smoothing == "auto", "`smoothing` is a number
 MENDS = Condition(lambda plan: plan.mends, "`mend_images` is False")
 HAS_STARS = Condition(lambda plan: len(plan.setup.stars) > 0, "there are no stars")
 SEVERAL = Condition(lambda plan: plan.setup.observation.n_images > 1, "there is one image")
-STEADY_STARS = Condition(
-    lambda plan: plan.setup.observation.n_epochs == 1 or len(plan.setup.stars) >= FEWEST,
+# From filter to filter a star has another flux, and neither varies nor moves in one.
+STEADY = Condition(
+    lambda plan: plan.setup.observation.is_of_one_time or len(plan.setup.stars) >= FEWEST,
     "fewer than three stars may vary from epoch to epoch",
 )
-# From filter to filter a star has another flux, and lies where it does.
-STEADY_PLACES = Condition(
-    lambda plan: STEADY_STARS.holds(plan) or plan.setup.observation.is_of_one_time,
-    STEADY_STARS.otherwise,
+ALIKE = Condition(
+    lambda plan: max(Counter(map(tuple, plan.setup.observation.components)).values()) > 1,
+    "there is one image of each filter",
 )
 SHOWS_PSFS = Condition(
     lambda plan: bool((owned(plan.setup.observation, plan.setup.stars) < 0).any()),
@@ -77,10 +78,10 @@ WHOLE = Condition(lambda plan: not plan.in_tiles, "the images are divided into t
 
 # What each step needs, in the order in which reasons are given.
 NEEDS: dict[str, tuple[Condition, ...]] = {
-    PLACES: (AUTO, MENDS, HAS_STARS, SEVERAL, SHOWS_PSFS, STEADY_PLACES, NO_HALOS, WHOLE),
+    PLACES: (AUTO, MENDS, HAS_STARS, SEVERAL, SHOWS_PSFS, STEADY, NO_HALOS, WHOLE),
     CORES: (AUTO, MENDS, HAS_STARS),
     RAYS: (AUTO, MENDS),
-    EXPOSURES: (AUTO, MENDS, HAS_STARS, SEVERAL, STEADY_STARS, NO_HALOS),
+    EXPOSURES: (AUTO, MENDS, HAS_STARS, SEVERAL, ALIKE, STEADY, NO_HALOS),
     LEVELS: (AUTO, HAS_ERROR, WHOLE),
     PSFS: (AUTO, HAS_STARS, SHOWS_PSFS),
     HALOS: (AUTO, HAS_HALOS),

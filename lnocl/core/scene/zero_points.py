@@ -5,6 +5,8 @@ its PSF. The ratio of two images then hardly hangs on the shapes of PSFs, and no
 the star. Circles of three sizes tell a zero point, which all have, from a PSF that is wrong, and
 from light beside the star, such as a cosmic ray, that one image has.
 
+A star has another flux in each filter, so that images are compared with those of their own.
+
 In several epochs a star may vary. So there a zero point is that of three stars or more: of the one
 in the middle, by their scatter. The median deviation of few stars is small by chance: of n it is
 taken to follow Student's distribution of n - 2 degrees of freedom (docs/validation/epochs.md).
@@ -12,6 +14,7 @@ taken to follow Student's distribution of n - 2 degrees of freedom (docs/validat
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -65,6 +68,24 @@ class ZeroPoints(NamedTuple):
 
 def zero_points(scene: Scene) -> ZeroPoints | None:
     """Return the zero points that are used, 0 where none is; None where no image has one."""
+    if scene.mixing is None:
+        return _of_one_filter(scene)
+    filters = [images for images in scene.mixing.images if len(images) > 1]
+    each = [_of_one_filter(scene.of_images(images)) for images in filters]
+    found = [(images, of) for images, of in zip(filters, each, strict=True) if of is not None]
+    return _joined(scene.n_images, found) if found else None
+
+
+def _joined(n: int, found: Sequence[tuple[Sequence[int], ZeroPoints]]) -> ZeroPoints:
+    """Return the zero points of n images from those of some."""
+    arrays = {name: np.zeros(n) for name in ("values", "errors", "numbers", "scatters")}
+    for images, of in found:
+        for name, joined in arrays.items():
+            joined[images] = getattr(of, name)
+    return ZeroPoints(n_stars=max(of.n_stars for _, of in found), **arrays)
+
+
+def _of_one_filter(scene: Scene) -> ZeroPoints | None:
     fewest = FEWEST if scene.n_epochs > 1 else 1
     # Few stars lie so far from others that the largest circle tells of them.
     measured = [_measured(scene, *each) for each in zip(CIRCLES, (fewest, fewest, 1), strict=True)]
@@ -112,7 +133,10 @@ def _measured(scene: Scene, radius: float, fewest: int) -> ZeroPoints | None:
         values = np.array([each[0] for each in found])
     errors, scatters = np.array(found)[:, 1:].T
     numbers = is_good.sum(axis=1).astype(np.float64)
-    return ZeroPoints(values - np.nanmedian(values), errors, len(stars), numbers, scatters)
+    # Of two in the middle the brighter one: clouds dim.
+    values -= np.nanquantile(values, 0.5, method="higher")
+    middle = np.nanmedian(errors) * np.sqrt(np.pi / 2.0 / np.isfinite(values).sum())
+    return ZeroPoints(values, np.hypot(errors, middle), len(stars), numbers, scatters)
 
 
 def _middle(values: Array, errors: Array) -> tuple[float, float, float]:
