@@ -34,6 +34,7 @@ def reconstruct(
     progress: bool = False,
     checkpointer: Checkpointer | None = None,
     own: NDArray[np.intp] | None = None,
+    within: tuple[slice, slice] | None = None,
 ) -> Outcome:
     """Return the outcome with the first penalty, or with those that held-out counts choose.
 
@@ -49,6 +50,8 @@ def reconstruct(
         Writes checkpoints, and holds the one to resume from.
     own : ndarray of int, optional
         The stars of which it is warned; by default all.
+    within : tuple of slice, optional
+        Rows and columns of the sky whose errors held-out counts choose by; by default all.
     """
     setup, penalties, steady = prepared.setup, prepared.penalties, prepared.steady
     n_iter, stop = prepared.n_iter, prepared.stop
@@ -71,7 +74,8 @@ def reconstruct(
             prior = told_prior(told)
             penalties = [replace(penalty, stars=prior) for penalty in penalties]
         if stop == "held-out":
-            held_out = HeldOutCounts(start, penalties, n_iter, n_iter if callback is None else 1)
+            stride = n_iter if callback is None else 1
+            held_out = HeldOutCounts(start, penalties, n_iter, stride, within)
             outcome = _choose(held_out, callback, progress, checkpointer)
             if outcome.stop_reason != "held-out" or not held_out.finds_no_end:
                 return outcome

@@ -145,8 +145,8 @@ def deconvolve_tiles(
 
     All tiles have the same weights and the same δ of the edge-preserving term, and the same number
     of iterations unless `stop` is a number. Where held-out counts or the discrepancy choose, the
-    three tiles with the brightest extended source do so. The middle one of their choices serves
-    all.
+    three tiles with the brightest extended source do so, held-out counts by their parts without
+    margins. The middle one of their choices serves all.
 
     Parameters
     ----------
@@ -322,7 +322,7 @@ def _alone(result: Result, **changes: Any) -> Result:
 
 def _outcome(prepared: Prepared, tile: Tile) -> Outcome:
     prepared = prepared.of(tile.observation, tile.stars).penalised(near_stars=tile.near_stars)
-    outcome = reconstruct(prepared, own=tile.own)
+    outcome = reconstruct(prepared, own=tile.own, within=tile.core)
     if prepared.is_within and len(tile.stars):
         outcome = outcome.marginal(stars=True, halos=False, levels=False)
     return replace(outcome, psf_refinement=prepared.refinement)

@@ -18,6 +18,7 @@ from lnocl.commands import cli
 from lnocl.commands.deconvolve import in_tiles
 from lnocl.core.scene.shifting import MovablePsf
 from lnocl.errors import InputError
+from lnocl.metrics import restoration_error
 
 HALF = 10
 Y, X = np.mgrid[-HALF : HALF + 1, -HALF : HALF + 1].astype(float)
@@ -423,6 +424,21 @@ def test_all_tiles_use_the_settings_chosen_by_the_brightest():
     assert len(result.held_out)
     assert set(result.tiles["n_iter"]) == {result.n_iter}
     assert result.smoothing in set(result.held_out["smoothing"])
+
+
+def test_stars_beyond_a_tile_do_not_choose_for_it():
+    """Their light is in its margins, as pixels as bright, of which held-out counts are sure."""
+    stars = np.array([(92.0, 30.0), (36.0, 100.0), (30.0, 92.0), (100.0, 36.0)])
+    sky, of_star = make_sky(4), vary(0.0, 0.0, growth=0.0)
+    light = sky.copy()
+    np.add.at(light, tuple(stars.astype(int).T[::-1]), 1e6)
+    means = fftconvolve(light, of_star, "same").clip(0) + 5.0
+    counts = np.random.default_rng(8).poisson(means)
+    observation = lnocl.Observation(counts, of_star, background=5.0, psf_error=0)
+    whole = lnocl.deconvolve(observation, stars, engine="numpy")
+    found = lnocl.deconvolve_tiles(observation, stars, tile=96, pad=4, engine="numpy")
+    errors = [restoration_error(each.extended, sky) for each in (whole, found)]
+    assert errors[1] < 1.2 * errors[0]
 
 
 def test_light_of_stars_makes_no_tile_bright():

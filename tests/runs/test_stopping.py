@@ -186,6 +186,9 @@ class TestHalves:
             split_counts(observation)
 
 
+ALL = np.s_[:, :]
+
+
 def snapshot(iteration, a, b):
     """Return a snapshot of halves with one row of pixels."""
     return Snapshot(iteration, np.array([[a], [b]]), np.zeros((2, 0)), np.zeros((2, 0, 2)))
@@ -198,7 +201,7 @@ def test_estimated_errors_are_unbiased(seed):
     truth = 1.0 + rng.random(10_000)
     noise = rng.normal(0.0, 0.1, (2, 2, truth.size))
     (a, b), last = (truth / 2 + each for each in noise)
-    found = assess([snapshot(1, a, b)], snapshot(2, *last), (1, truth.size))
+    found = assess([snapshot(1, a, b)], snapshot(2, *last), ALL)
     error = np.linalg.norm(a + b - truth) ** 2
     # Six standard errors: 4 |truth / 2| 0.1 twice.
     allowed = 6.0 * 4.0 * 0.1 * np.linalg.norm(truth)
@@ -211,7 +214,7 @@ def test_estimated_errors_are_unbiased(seed):
 def test_halves_that_are_nearly_the_same_are_judged(seed):
     """In single precision, in which rounding leaves their squared difference below 0."""
     a = np.random.default_rng(seed).random(400).astype(np.float32)
-    found = assess([snapshot(1, a, np.nextafter(a, np.float32(2)))], snapshot(2, a, a), (1, 400))
+    found = assess([snapshot(1, a, np.nextafter(a, np.float32(2)))], snapshot(2, a, a), ALL)
     assert found.noise[0] >= 0
     assert found.best == found.chosen == 0
 
@@ -223,7 +226,7 @@ def test_the_last_iteration_within_a_tenth_of_the_least_error_is_chosen(n_last):
     for k in range(1, n_last + 1):
         wide = 5.0 + 0.5 * max(12 - k, 0)
         halves.append(snapshot(k, *(wide + 0.1 * k * rng.standard_normal((2, 4000)))))
-    found = assess(halves, halves[-1], (1, 4000))
+    found = assess(halves, halves[-1], ALL)
     assert found.best == 11
     noise = [((a - b) ** 2).sum() for a, b in (each.extended for each in halves)]
     np.testing.assert_allclose(found.noise, noise)
@@ -240,7 +243,7 @@ def test_errors_are_measured_within_the_images():
         each._replace(extended=np.concatenate([each.extended, 1e3 * rng.random((2, 1, 9))], axis=2))
         for each in inside
     ]
-    found, expected = (assess(each, each[-1], (1, 30)) for each in (wide, inside))
+    found, expected = (assess(each, each[-1], np.s_[:, :30]) for each in (wide, inside))
     np.testing.assert_array_equal(found.excess, expected.excess)
     np.testing.assert_array_equal(found.noise, expected.noise)
 
@@ -396,8 +399,8 @@ class TestSmoothing:
         """Which have no bias in common; the others end at 1.5 times the iteration chosen."""
         judged = []
 
-        def note(snapshots, reference, shape):
-            found = assess(snapshots, reference, shape)
+        def note(snapshots, reference, within):
+            found = assess(snapshots, reference, within)
             judged.append((snapshots, reference, found))
             return found
 

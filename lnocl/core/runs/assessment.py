@@ -50,7 +50,7 @@ class Assessment(NamedTuple):
 
 
 def assess(
-    snapshots: Sequence[Snapshot], reference: Snapshot, shape: tuple[int, int]
+    snapshots: Sequence[Snapshot], reference: Snapshot, within: tuple[slice, slice]
 ) -> Assessment:
     """Return the errors of snapshots.
 
@@ -60,8 +60,8 @@ def assess(
         At least one.
     reference : Snapshot
         A_L and B_L.
-    shape : tuple of int
-        Shape (ny, nx) of the images, within which errors are measured.
+    within : tuple of slice
+        Rows and columns within which errors are measured.
 
     Raises
     ------
@@ -70,8 +70,7 @@ def assess(
     """
 
     def products(a: NDArray[np.floating], b: NDArray[np.floating]) -> Array:
-        ny, nx = shape
-        rows = np.einsum("...yx,...yx->...y", a[..., :ny, :nx], b[..., :ny, :nx])
+        rows = np.einsum("...yx,...yx->...y", a[..., *within], b[..., *within])
         return np.asarray(rows.sum(axis=-1, dtype=np.float64))
 
     def product(a: NDArray[np.floating], b: NDArray[np.floating]) -> float:

@@ -60,6 +60,8 @@ class HeldOutCounts:
         Iterations at most.
     stride : int
         Iterations between two looks at halves, at most.
+    within : tuple of slice, optional
+        Rows and columns of the sky whose errors count; by default all that images show.
 
     Raises
     ------
@@ -68,10 +70,16 @@ class HeldOutCounts:
     """
 
     def __init__(
-        self, start: Start, penalties: Sequence[Penalty], n_iter: int, stride: int
+        self,
+        start: Start,
+        penalties: Sequence[Penalty],
+        n_iter: int,
+        stride: int,
+        within: tuple[slice, slice] | None = None,
     ) -> None:
         self._start, self._penalties, self._n_iter = start, penalties, n_iter
-        self._stride, self._shape = stride, start.scene.observation.sky_shape
+        ny, nx = start.scene.observation.sky_shape
+        self._stride, self._within = stride, within or (slice(ny), slice(nx))
         self._counts = split_counts(start.scene.observation)
         self._curves: list[NDArray[np.void]] = []
         self._first: _First | None = None
@@ -172,7 +180,7 @@ class HeldOutCounts:
         last = halves.snapshots[-1]
         if last.iteration != halves.done or last.iteration < self._next_look:
             return False
-        found = assess(halves.snapshots, last, self._shape)
+        found = assess(halves.snapshots, last, self._within)
         chosen, best = (halves.snapshots[k].iteration for k in (found.chosen, found.best))
         self._next_look = max(MIN_ITERATIONS, LENGTH_RATIO * chosen)
         oldest = min(OLDEST_SNAPSHOT * chosen, best)
@@ -188,7 +196,7 @@ class HeldOutCounts:
                 "and `stop` None"
             )
         reference = snapshots[-1] if self._first is None else self._first.reference
-        found = assess(snapshots, reference, self._shape)
+        found = assess(snapshots, reference, self._within)
         chosen = snapshots[found.chosen]
         if self._first is None:
             # The least squared error is taken to be the noise alone.
