@@ -37,7 +37,7 @@ from lnocl.tiling import Span, Tile, cut, lay
 
 # Of those of `lnocl.deconvolve`, beside parameters.
 OPTIONS = {"solver", "precision", "engine", "device", "pad", "refine_positions", "refine_psfs"}
-OPTIONS |= {"mend_images"}
+OPTIONS |= {"mend_images", "spectral_smoothing"}
 # The tiles with the brightest extended source, of whose choices that in the middle is taken.
 N_CHOOSING = 3
 # Warnings of tiles that are given in full.
@@ -94,8 +94,10 @@ class _Found(NamedTuple):
         Of the table of tiles.
     models : ndarray of float64
         Of the images in its window.
-    flux : tuple of float
-        Of the extended source there, and its standard error, electrons.
+    noise : ndarray of float64 or None
+        Of components there, as `lnocl.core.solvers.light.pixel_noise`.
+    fluxes : ndarray of float64, shape (G, 2)
+        Of the extended source there that each filter shows, and its standard error, electrons.
     numbers : ndarray of int, shape (k,)
         Which of all stars in each epoch are its own.
     stars : ndarray of float64, shape (k, 6)
@@ -111,7 +113,8 @@ class _Found(NamedTuple):
     result: Result
     row: tuple[Any, ...]
     models: Array
-    flux: tuple[float, float]
+    noise: Array | None
+    fluxes: Array
     numbers: NDArray[np.intp]
     stars: Array
     covariances: Array
@@ -143,10 +146,10 @@ def deconvolve_tiles(
     PSFs that are the same all over the images are judged once, as by `lnocl.deconvolve`: all tiles
     have those that were found, and star fluxes are marginal where they fit.
 
-    All tiles have the same weights and the same δ of the edge-preserving term, and the same number
-    of iterations unless `stop` is a number. Where held-out counts or the discrepancy choose, the
-    three tiles with the brightest extended source do so, held-out counts by their parts without
-    margins. The middle one of their choices serves all.
+    All tiles have the same weights and the same δ of the edge-preserving term of each sky, and the
+    same number of iterations unless `stop` is a number. Where held-out counts or the discrepancy
+    choose, the three tiles with the brightest extended source do so, held-out counts by their parts
+    without margins. The middle one of their choices serves all.
 
     Parameters
     ----------
@@ -174,7 +177,7 @@ def deconvolve_tiles(
         Show progress, as `lnocl.deconvolve` does.
     **options
         Others of `lnocl.deconvolve`: solver, precision, engine, device, pad, refine_positions,
-        refine_psfs, mend_images.
+        refine_psfs, mend_images, spectral_smoothing.
 
     Returns
     -------
@@ -250,10 +253,10 @@ def deconvolve_tiles(
             "out or mend the mask"
         )
     if len(tiles) > 1:
-        common = {"exposure": mean_exposure(observation)}
+        common: dict[str, Any] = {"exposure": mean_exposure(observation)}
         if near_stars is not None or any(each.smoothing for each in prepared.penalties):
             with ignored_warnings():  # of which the tiles know more
-                common["edge"] = EDGE * Scene(observation, positions).level
+                common["edges"] = tuple(EDGE * Scene(observation, positions).levels)
         prepared = prepared.penalised(**common)
     pad = tile_pad if len(tiles) > 1 else pad
     # It goes to other processes, without the whole images.
@@ -288,8 +291,6 @@ def _ending(prepared: Prepared, choice: Result) -> Prepared:
 
 def for_the_whole(observation: Observation) -> str | None:
     """Return why an observation is not for tiles, and what to do; None where it is."""
-    if observation.component_names:
-        return "tiles are of one sky; take deconvolve for the whole, or leave `components` out"
     if len(observation.halos):
         return (
             "a tile cannot tell the `halos` in it from a smooth sky, as whole images can; take "
@@ -342,7 +343,7 @@ def _solve(prepared: Prepared, tile: Tile) -> _Found:
             raise InputError(f"{begins}: {error.message}") from error
         errors = outcome.star_errors()
     result, (y, x), at_stars = make_result(outcome), tile.spans, outcome.star_residuals()
-    within = np.zeros(result.extended.shape)
+    within = np.zeros(tile.observation.sky_shape)
     within[tile.core] = 1.0
     own, numbers = (_in_epochs(each, tile.observation) for each in (tile.own, tile.numbers))
     positions = result.star_positions + np.array([x.window.start, y.window.start])
@@ -350,7 +351,13 @@ def _solve(prepared: Prepared, tile: Tile) -> _Found:
         _alone(result),
         (x.core.start, y.core.start, len(x.core), len(y.core), *result.history[-1]),
         np.array(list(outcome.models())),
-        Light(outcome.estimate).flux(within, errors.fluxes),
+        outcome.pixel_noise() if result.component_names else None,
+        np.array(
+            [
+                Light(part.estimate).flux(within, errors.fluxes[part.fluxes])
+                for part in outcome.estimate.parts
+            ]
+        ),
         numbers,
         np.column_stack([positions, result.star_fluxes, errors.fluxes, errors.positions])[own],
         errors.covariances[tile.own],
@@ -399,9 +406,11 @@ class _Mosaic:
         self.plan, n_epochs = tuple(str(plan).splitlines()), observation.n_epochs
         self.observation = observation
         self.given_positions = np.repeat(positions, n_epochs, axis=0)
-        # The sky times weights, and these.
+        # The skies times weights, and these.
         shape = [observation.oversample * len(each.sky) for each in spans]
-        self._first, self._sky = [each.sky.start for each in spans], np.zeros((2, *shape))
+        self._first, self._weights = [each.sky.start for each in spans], np.zeros(shape)
+        self._sky = np.zeros((*observation.skies_shape[:-2], *shape))
+        self._noise = np.full(self._sky.shape if observation.component_names else 0, np.nan)
         # Where no tile sees the sky images have their background.
         _, background = together(observation.images, observation.background)
         self._models = np.zeros(observation.images.shape) + background
@@ -414,15 +423,18 @@ class _Mosaic:
         (y, x), q, sky = tile.spans, self.observation.oversample, found.result.extended
         weights = np.multiply.outer(y.weights(q), x.weights(q))
         first_y, first_x = (q * (at.window.start - at.sky.start) for at in tile.spans)
-        there = self._sky[:, first_y : first_y + len(sky), first_x : first_x + sky.shape[1]]
-        there += weights * sky, weights
+        there = slice(first_y, first_y + len(weights)), slice(first_x, first_x + weights.shape[1])
+        self._sky[..., *there] += weights * sky
+        self._weights[there] += weights
+        if found.noise is not None:
+            self._noise[..., *there][..., *tile.core] = found.noise[..., *tile.core]
         self._stars[found.numbers] = found.stars
         n = self.observation.n_epochs
         self._covariances[found.numbers[::n] // n] = found.covariances
         self.add_models(tile, found.models)
         nothing = np.zeros(0)
         result = replace(found.result, extended=nothing)
-        self.found.append(found._replace(result=result, models=nothing))
+        self.found.append(found._replace(result=result, models=nothing, noise=None))
 
     def add_models(self, tile: Tile, models: Array) -> None:
         """Take the pixels of images that show the core of a tile from the models of its window."""
@@ -439,17 +451,16 @@ class _Mosaic:
         """Return it all, with the choice that was made for all tiles."""
         results = [each.result for each in self.found]
         longest = max(results, key=lambda each: each.n_iter)
-        history, (ny, nx) = longest.history.copy(), self.observation.sky_shape
+        history = longest.history.copy()
         objectives = (each.history["objective"] for each in results)
         history["objective"] = sum(
             np.pad(each, (0, len(history) - len(each)), "edge") for each in objectives
         )
-        y, x = (-self.observation.oversample * each for each in self._first)
-        sky, weight = self._sky[:, y : y + ny, x : x + nx]
+        sky, weight = map(self._in_frame, (self._sky, self._weights))
         choice = chosen or longest
         same = {name: getattr(choice, name) for name in ("n_iter", "stop_reason", "held_out")}
         found = {
-            "extended": np.divide(sky, weight, out=np.zeros((ny, nx)), where=weight > 0),
+            "extended": np.divide(sky, weight, out=np.zeros(sky.shape), where=weight > 0),
             "star_fluxes": self._stars[:, 2],
             "star_positions": self._stars[:, :2],
             "history": history,
@@ -457,6 +468,16 @@ class _Mosaic:
             "tiles": np.array([each.row for each in self.found], TILE_DTYPE),
         }
         return TiledResult(**vars(longest) | same | found)
+
+    def _in_frame(self, array: Array) -> Array:
+        """Return what is in the sky's frame of all that tiles stand for."""
+        (ny, nx), q = self.observation.sky_shape, self.observation.oversample
+        y, x = (-q * each for each in self._first)
+        return array[..., y : y + ny, x : x + nx]
+
+    def pixel_noise(self) -> Array:
+        """Return the noise of each component's pixels, electrons, shape (K, ny, nx)."""
+        return self._in_frame(self._noise)
 
     @property
     def setup(self) -> Setup:
@@ -475,15 +496,28 @@ class _Mosaic:
         """Return the amounts of halos, which tiles do not have."""
         return np.zeros((0, self.observation.n_images))
 
-    def extended_flux(self, star_flux_errors: Array) -> tuple[float, float]:
-        """Return the light of the extended source and its standard error, electrons."""
-        fluxes, errors = zip(*(each.flux for each in self.found), strict=True)
+    def extended_flux(self, star_flux_errors: Array) -> tuple[Any, Any]:
+        """Return the light of the extended source and its standard error, electrons.
+
+        With several skies they are arrays of shape (K,).
+        """
+        from lnocl.core.solvers.light import of_components  # which loads scipy
+
+        observation = self.observation
+        found = np.array([each.fluxes for each in self.found])
         # The level of an image is wrong in all its tiles alike.
-        exposure = means(self.observation.exposure, self.observation.mask)
-        exposure = exposure * self.observation.scales**2
-        error = float(np.linalg.norm(self.observation.background_error)) / float(exposure.sum())
-        n_pixels = math.prod(self.observation.geometry.frame)
-        return sum(fluxes), math.hypot(*errors, n_pixels * error)
+        exposure = means(observation.exposure, observation.mask) * observation.scales**2
+        mixing = observation.mixing
+        images = [list(range(observation.n_images))] if mixing is None else mixing.images
+        levels = [
+            np.linalg.norm(observation.background_error[own]) / exposure[own].sum()
+            for own in images
+        ]
+        n_pixels = math.prod(observation.geometry.frame)
+        errors = np.hypot(np.linalg.norm(found[:, :, 1], axis=0), n_pixels * np.array(levels))
+        fluxes, covariance = of_components(observation, found[:, :, 0].sum(axis=0), errors)
+        of_each = np.sqrt(np.diag(covariance))
+        return (float(fluxes[0]), float(of_each[0])) if mixing is None else (fluxes, of_each)
 
     def star_residuals(self) -> list[StarResiduals]:
         """Return how well the model fits at each star."""

@@ -66,7 +66,7 @@ def solve(
                 "`parallel` does nothing without tiles: give `tile` too, or leave it out"
             )
         return deconvolve(frames.observation, **parameters, callback=callback)
-    for name in ("checkpoint", "resume", "spectral_smoothing"):
+    for name in ("checkpoint", "resume"):
         if parameters.pop(name, None):
             raise InputError(f"`{name}` is not for tiles; leave it out")
     how = {"tile": arguments.tile, "parallel": arguments.parallel}

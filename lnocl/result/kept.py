@@ -94,8 +94,10 @@ def from_parts(
     has_prior = bool(_part(parts, "penalty.stars."))
     prior = _built(StarPrior, parts, "penalty.stars.") if has_prior else None
     with ignored_warnings():  # which the run has given
-        shares = parts["penalty.shares"]  # text where there are none
-        known = {"stars": prior, "shares": tuple(shares.tolist()) if shares.ndim else ()}
+        known: dict[str, Any] = {"stars": prior}
+        for name in ("shares", "edges"):  # text where there are none
+            each = parts[f"penalty.{name}"]
+            known[name] = tuple(each.tolist()) if each.ndim else ()
         scene = setup.scene(_built(Penalty, parts, "penalty.", **known))
         if setup.refine_positions and scene.n_stars:
             scene.move_stars(parts["positions"])

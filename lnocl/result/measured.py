@@ -59,6 +59,9 @@ class Findings(Protocol):
     def extended_flux(self, star_flux_errors: Array) -> tuple[Any, Any]:
         """Return the light of the extended source and its standard error, electrons."""
 
+    def pixel_noise(self) -> Array:
+        """Return the noise of each component's pixels, electrons, shape (K, ny, nx)."""
+
     def star_residuals(self) -> list[StarResiduals]:
         """Return how well the model fits at each star."""
 

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from lnocl.core.runs.outcome import mean_over_epochs
 from lnocl.core.scene.arrays import Array
-from lnocl.core.scene.components import Mixing
-from lnocl.core.scene.detector import psfs_on_detector
 from lnocl.plotting.light_curves import light_curves
 from lnocl.plotting.result import ResultView
 from lnocl.result.summary import Unit
@@ -41,33 +39,9 @@ def electrons_in(result: Result, electrons: float) -> Array:
     return np.where(found > 0, found, np.nan)
 
 
-def noise_of(result: Result, electrons: float) -> Array:
-    r"""Return the noise of each component by the counts that it is seen in, shape (K, ny, nx).
-
-    It is that of the light of a pixel, in a unit of so many electrons, as the mean over the area
-    of the PSFs. With U the pseudo-inverse of the weights of filters g, its square is
-
-    .. math:: \sum_g U_{kg}^2 \Big/ \sum_{j \in g} A_j^T \frac{e_j}{m_j \sum K_j^2}.
-    """
-    from lnocl.core.scene.forward_model import Model  # which loads scipy
-
-    estimate, observation = result._outcome.estimate, result._observation
-    ny, nx = observation.sky_shape
-    areas = 1.0 / (psfs_on_detector(observation) ** 2).sum(axis=(1, 2))
-    variances = []
-    for part in estimate.parts:
-        scene, models = part.estimate.scene, part.estimate.models()
-        model = Model(scene)
-        pairs = zip(areas[list(part.images)], model.weights, models, strict=True)
-        told = model.adjoint(
-            np.divide(area * weights, each, out=np.zeros(each.shape), where=each > 0)
-            for area, weights, each in pairs
-        )[:ny, :nx]
-        told *= scene.scale / scene.unit**2
-        variances.append(np.divide(1.0, told, out=np.full((ny, nx), np.nan), where=told > 0))
-    undone = cast(Mixing, observation.mixing).undone
-    noise = np.sqrt(np.einsum("kg,gyx->kyx", undone**2, variances))
-    return np.asarray(noise / (electrons * observation.oversample**2))
+def noise_of(result: Result, electrons: float) -> Array | None:
+    """Return `Findings.pixel_noise` in a unit of so many electrons; None without components."""
+    return result._findings.pixel_noise() / electrons if result.component_names else None
 
 
 def view_of(result: Result, unit: Unit | None = None) -> ResultView:
@@ -99,5 +73,5 @@ def view_of(result: Result, unit: Unit | None = None) -> ResultView:
             unit.name,
         ),
         names=result.component_names,
-        noise=noise_of(result, unit.electrons) if result.component_names else None,
+        noise=noise_of(result, unit.electrons),
     )

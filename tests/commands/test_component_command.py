@@ -15,7 +15,7 @@ import lnocl
 from lnocl.commands import cli
 from lnocl.io.saved_results import read_result
 
-N = 24
+N = 30
 STAR, FLUXES = (10, 12), (9000.0, 7000.0)
 COORDINATES = {"CTYPE1": "RA---TAN", "CTYPE2": "DEC--TAN", "CRVAL1": 30.0, "CRVAL2": 10.0,
                "CDELT1": -1e-4, "CDELT2": 1e-4, "CRPIX1": 12.0, "CRPIX2": 12.0}  # fmt: skip
@@ -148,12 +148,23 @@ def test_sources_are_told_in_images_of_one_filter(result, capsys):
             ["--component", "c=LAMBDA"],
             "--component 'c' has the weight 'LAMBDA', and on.fits has no",
         ),
-        (["--tile", "16"], "tiles are of one sky; take deconvolve for the whole, or leave --comp"),
     ],
 )
 def test_what_cannot_be_is_refused(words, capsys, more, told):
     assert cli.main([*words, "--quiet", *more]) == 2
     assert told in one_complaint(capsys.readouterr())
+
+
+def test_tiles_have_the_components_of_the_whole(words, capsys):
+    more, found = ["--spectral-smoothing", "0.5", "--n-iter", "300", "--mu", "1e-3"], []
+    for tile in ([], ["--tile", "24"]):
+        assert cli.main([*words, "--quiet", *more, *tile]) == 0, capsys.readouterr().err
+        found.append(read_result("out.fits"))
+    whole, tiles = found
+    assert tiles.component_names == NAMES
+    difference = abs(tiles.extended - whole.extended)
+    assert 0.0 < difference.max() < 5e-3 * whole.extended.max()
+    np.testing.assert_allclose(tiles.noise, whole.noise, rtol=0.03)
 
 
 def test_its_stars_are_taken_once_each(words, result, capsys):

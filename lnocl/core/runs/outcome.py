@@ -364,6 +364,15 @@ class Outcome:
         lights = [Light(part.estimate, levels) for part, levels in pairs]
         return lights[0] if self.scene.mixing is None else LightOfComponents(self.estimate, lights)
 
+    def pixel_noise(self) -> Array:
+        """Return the noise of each sky's pixels by the counts that they are seen in, (K, ny, nx).
+
+        `lnocl.core.solvers.light.pixel_noise` has the equation.
+        """
+        from lnocl.core.solvers.light import pixel_noise  # which loads scipy
+
+        return pixel_noise(self.estimate)
+
     @cached_property
     def levels(self) -> list[Levels | None]:
         """The levels of the background of each filter's images; None where they are known."""

@@ -246,7 +246,7 @@ def _penalties(plan: Plan, mended: Mended, are_psfs_wrong: bool) -> list[Penalty
     elif plan.stop == "held-out":
         multiples, reason = (0.0, *MULTIPLES), ""
     weights = (each * recommended for each in multiples)
-    first = Penalty(plan.mu, 0.0, None, mended.near_stars, shares, plan.spectral_smoothing)
+    first = Penalty(plan.mu, 0.0, (), mended.near_stars, shares, plan.spectral_smoothing)
     penalties = [replace(first, smoothing=each) for each in weights]
     if reason:
         detail(f"`smoothing` chosen: {penalties[0].in_words()}, by {reason}")

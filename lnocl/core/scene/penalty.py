@@ -43,8 +43,8 @@ class Penalty:
         Weight of the Tikhonov term, per electron, zero or more.
     smoothing : float
         Weight of the edge-preserving term, zero or more. It has no unit.
-    edge : float or None
-        delta, in the unit of the extended source; None: three times its mean, roughly.
+    edges : tuple of float
+        delta in each sky, in the unit of the extended source; empty: three times its mean, roughly.
     near_stars : ndarray of float64, of the shape of the extended source, or None
         Weight of the edge-preserving term beside `smoothing` in each pixel; a pair of pixels has
         the mean of both. None: 0 everywhere.
@@ -66,7 +66,7 @@ class Penalty:
 
     mu: float = 0.0
     smoothing: float = 0.0
-    edge: float | None = None
+    edges: tuple[float, ...] = ()
     near_stars: Array | None = field(default=None, compare=False)
     shares: tuple[float, ...] = ()
     spectral: float = 0.0

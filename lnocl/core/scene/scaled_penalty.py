@@ -44,8 +44,8 @@ def scaled(penalty: Penalty, scene: Scene) -> Scaled:
         smoothing_map = smoothing + longer * enlarged(penalty.near_stars, scene.grid)
     if np.any(smoothing) or smoothing_map is not None or spectral:
         edge = EDGE * scene.rough_fit.level
-        if penalty.edge is not None:
-            edge = 0.0 * smoothing + penalty.edge / scene.unit
+        if penalty.edges:
+            edge = np.reshape(penalty.edges, np.shape(edge)) / scene.unit
     mu = _scaled("mu", penalty.mu, scene.scale * longer**2, scene)
     star_prior = penalty.stars and penalty.stars.scaled(scene.unit, scene.scale)
     return mu, smoothing, smoothing_map, edge, star_prior, spectral

@@ -618,9 +618,9 @@ class Scene:
         return first_estimate(self, extended, star_fluxes)
 
     @property
-    def level(self) -> float:
-        """The mean of the extended source, electrons per pixel of it, by linear least squares."""
-        return float(self.rough_fit.level * self.unit)
+    def levels(self) -> Array:
+        """The mean of each sky, electrons per pixel of it, by linear least squares; shape (K,)."""
+        return np.ravel(self.rough_fit.level) * self.unit
 
     @cached_property
     def rough_fit(self) -> RoughFit:

@@ -25,9 +25,10 @@ from numpy.typing import NDArray
 from lnocl.core.scene.arrays import Array
 from lnocl.core.scene.camera import images_of, is_flat
 from lnocl.core.scene.components import Mixing
-from lnocl.core.scene.detector import on_sky
+from lnocl.core.scene.detector import on_sky, psfs_on_detector
 from lnocl.core.scene.estimate import Estimate
 from lnocl.core.scene.forward_model import Model
+from lnocl.core.scene.observation import Observation
 from lnocl.core.scene.transforms import enlarged
 from lnocl.core.solvers.levels import Levels
 
@@ -173,13 +174,48 @@ class LightOfComponents:
         """Return the sums of `Light.flux` of each sky, (K,), and their covariances, (K, K)."""
         pairs = zip(self._lights, self._estimate.parts, strict=True)
         found = [light.flux(shares, star_flux_errors[part.fluxes]) for light, part in pairs]
-        sums, errors = np.array(found).T
-        undone = self._mixing.undone
-        fluxes = undone @ sums
-        each = self._estimate.scene.observation.component_errors
-        most = [each[part.images].max(axis=0) for part in self._estimate.parts]
-        of_weights = np.square(most) @ fluxes**2
-        return fluxes, undone * (errors**2 + of_weights) @ undone.T
+        return of_components(self._estimate.scene.observation, *np.array(found).T)
+
+
+def of_components(observation: Observation, sums: Array, errors: Array) -> tuple[Array, Array]:
+    """Return that of `LightOfComponents.covariance` for sums of what each filter shows, (G,).
+
+    Where there is one sky it is its own.
+    """
+    mixing = observation.mixing
+    if mixing is None:
+        return sums, np.diag(errors**2)
+    fluxes, each = mixing.undone @ sums, observation.component_errors
+    most = [each[images].max(axis=0) for images in mixing.images]
+    of_weights = np.square(most) @ fluxes**2
+    return fluxes, mixing.undone * (errors**2 + of_weights) @ mixing.undone.T
+
+
+def pixel_noise(estimate: Estimate) -> Array:
+    r"""Return the noise of each sky by the counts that it is seen in, electrons, (K, ny, nx).
+
+    It is that of the light of a pixel as the mean over the area of the PSFs; NaN where none is
+    seen. With U the pseudo-inverse of the weights of filters g, its square is
+
+    .. math:: \sum_g U_{kg}^2 \Big/ \sum_{j \in g} A_j^T \frac{e_j}{m_j \sum K_j^2}.
+    """
+    observation = estimate.scene.observation
+    ny, nx = observation.sky_shape
+    areas = 1.0 / (psfs_on_detector(observation) ** 2).sum(axis=(1, 2))
+    variances = []
+    for part in estimate.parts:
+        scene, models = part.estimate.scene, part.estimate.models()
+        model = Model(scene)
+        pairs = zip(areas[list(part.images)], model.weights, models, strict=True)
+        told = model.adjoint(
+            np.divide(area * weights, each, out=np.zeros(each.shape), where=each > 0)
+            for area, weights, each in pairs
+        )[:ny, :nx]
+        told *= scene.scale / scene.unit**2
+        variances.append(np.divide(1.0, told, out=np.full((ny, nx), np.nan), where=told > 0))
+    undone = np.ones((1, 1)) if observation.mixing is None else observation.mixing.undone
+    noise = np.sqrt(np.einsum("kg,gyx->kyx", undone**2, variances))
+    return np.asarray(noise / observation.oversample**2)
 
 
 def _over(image: Array, ones: Array | float) -> Array:
