@@ -7,9 +7,9 @@ from light beside the star, such as a cosmic ray, that one image has.
 
 A star has another flux in each filter, so that images are compared with those of their own.
 
-In several epochs a star may vary. So there a zero point is that of three stars or more: of the one
-in the middle, by their scatter. The median deviation of few stars is small by chance: of n it is
-taken to follow Student's distribution of n - 2 degrees of freedom (docs/validation/epochs.md).
+In several epochs a star may vary. So there a zero point is that of three stars or more, by how much
+these vary against each other in all images together, with Student's distribution: three that agree
+in one of few images do so by chance (docs/validation/epochs.md).
 """
 
 from __future__ import annotations
@@ -32,8 +32,9 @@ FAINTEST, MOST_STARS, SYSTEMATIC = 0.1, 100, 0.005
 # Bad pixels may hold this share of a star's light, and leave so much of the ring.
 HIDDEN, LEFT = 0.05, 0.5
 # A zero point is used that is more than this, so many times its error, and the same in all circles
-# but for these shares, in the least and the largest beside the other, or so many errors.
-LEAST, SIGNIFICANT, ALIKE, APART = 0.03, 4.0, (0.5, 0.25), 3.0
+# but for these shares, in the least and the largest beside the other, or so many errors. Beside it
+# others are that are fewer times theirs: what made one is likely to have made them.
+LEAST, SIGNIFICANT, LIKELY, ALIKE, APART = 0.03, 4.0, 2.0, (0.5, 0.25), 3.0
 # Of several epochs, an image has so many good stars or no zero point.
 FEWEST = 3
 
@@ -47,23 +48,11 @@ class ZeroPoints(NamedTuple):
         NaN where an image shows no star well.
     n_stars : int
         Stars that they are measured on.
-    numbers, scatters : ndarray, shape (p,)
-        How many of them each image shows well, and the errors by their scatter alone.
     """
 
     values: Array
     errors: Array
     n_stars: int
-    numbers: Array
-    scatters: Array
-
-    def of_stars_that_vary(self) -> ZeroPoints:
-        """Return them with errors that are as rarely exceeded as those of normal noise."""
-        from scipy.stats import norm, t  # a third of a second, for several epochs
-
-        rare = norm.sf(SIGNIFICANT)
-        factors = t.isf(rare, np.maximum(self.numbers - 2.0, 1.0)) / SIGNIFICANT
-        return self._replace(errors=np.maximum(self.errors, factors * self.scatters))
 
 
 def zero_points(scene: Scene) -> ZeroPoints | None:
@@ -78,40 +67,39 @@ def zero_points(scene: Scene) -> ZeroPoints | None:
 
 def _joined(n: int, found: Sequence[tuple[Sequence[int], ZeroPoints]]) -> ZeroPoints:
     """Return the zero points of n images from those of some."""
-    arrays = {name: np.zeros(n) for name in ("values", "errors", "numbers", "scatters")}
+    values, errors = np.zeros((2, n))
     for images, of in found:
-        for name, joined in arrays.items():
-            joined[images] = getattr(of, name)
-    return ZeroPoints(n_stars=max(of.n_stars for _, of in found), **arrays)
+        values[images], errors[images] = of.values, of.errors
+    return ZeroPoints(values, errors, max(of.n_stars for _, of in found))
 
 
 def _of_one_filter(scene: Scene) -> ZeroPoints | None:
     fewest = FEWEST if scene.n_epochs > 1 else 1
     # Few stars lie so far from others that the largest circle tells of them.
-    measured = [_measured(scene, *each) for each in zip(CIRCLES, (fewest, fewest, 1), strict=True)]
-    if scene.n_epochs > 1:
-        measured = [each and each.of_stars_that_vary() for each in measured]
+    least, may_vary = (fewest, fewest, 1), (False, scene.n_epochs > 1, False)
+    measured = [_measured(scene, *each) for each in zip(CIRCLES, least, may_vary, strict=True)]
     found = [each for each in measured if each is not None]
     if len(found) < len(CIRCLES):
         return None
     core, middle, large = found
     with np.errstate(invalid="ignore"):
-        is_used = np.ones(scene.n_images, bool)
-        for each in (middle, large):
-            is_used &= abs(each.values) > np.maximum(LEAST, SIGNIFICANT * each.errors)
+        is_used = abs(middle.values) > np.maximum(LEAST, LIKELY * middle.errors)
         for each, share in zip((core, large), ALIKE, strict=True):
             apart = APART * np.hypot(each.errors, middle.errors)
             change = abs(each.values - middle.values)
             is_used &= change < np.maximum(share * abs(middle.values), apart)
-    if not is_used.any():
+        is_sure = is_used.copy()
+        for each in (middle, large):
+            is_sure &= abs(each.values) > np.maximum(LEAST, SIGNIFICANT * each.errors)
+    if not is_sure.any():
         return None
     return middle._replace(values=np.where(is_used, middle.values, 0.0))
 
 
-def _measured(scene: Scene, radius: float, fewest: int) -> ZeroPoints | None:
+def _measured(scene: Scene, radius: float, fewest: int, may_vary: bool) -> ZeroPoints | None:
     """Return the zero points in circles of so many widths, of images of so many good stars or more.
 
-    None where no star shows two.
+    None where no star shows two. Where stars may vary errors hold that.
     """
     fluxes, variances = _photometry(scene, radius)
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -131,28 +119,43 @@ def _measured(scene: Scene, radius: float, fewest: int) -> ZeroPoints | None:
         of_stars = np.nanmedian(logs - values[:, None], axis=0)
         found = [_middle(each - of_stars, error) for each, error in zip(logs, errors, strict=True)]
         values = np.array([each[0] for each in found])
-    errors, scatters = np.array(found)[:, 1:].T
-    numbers = is_good.sum(axis=1).astype(np.float64)
-    # Of two in the middle the brighter one: clouds dim.
-    values -= np.nanquantile(values, 0.5, method="higher")
-    middle = np.nanmedian(errors) * np.sqrt(np.pi / 2.0 / np.isfinite(values).sum())
-    return ZeroPoints(values, np.hypot(errors, middle), len(stars), numbers, scatters)
+    middles = np.array([each[1] for each in found])
+    if may_vary:
+        middles *= _varying(logs - of_stars, errors)
+    return ZeroPoints(values - np.nanmedian(values), middles, len(stars))
 
 
-def _middle(values: Array, errors: Array) -> tuple[float, float, float]:
-    """Return the weighted median of values that are not NaN, its error, and that by scatter."""
+def _varying(values: Array, errors: Array) -> float:
+    """Return by how much larger errors of zero points are as stars vary from image to image.
+
+    Pairs of stars tell that, whatever the zero points are.
+    """
+    from scipy.stats import norm, t  # a third of a second, for several epochs
+
+    n_images, n_stars = values.shape
+    ones, others = np.triu_indices(n_stars, 1)
+    apart = abs(values[:, ones] - values[:, others]) / np.hypot(errors[:, ones], errors[:, others])
+    freedom = max(int(np.isfinite(values).sum()) - n_images - n_stars + 1, 1)
+    if not np.isfinite(apart).any() or n_images == 1:
+        return np.inf
+    scatter = np.nanmedian(apart) / norm.ppf(0.75) * np.sqrt(n_images / (n_images - 1.0))
+    return float(max(scatter, 1.0) * t.isf(norm.sf(SIGNIFICANT), freedom) / SIGNIFICANT)
+
+
+def _middle(values: Array, errors: Array) -> tuple[float, float]:
+    """Return the weighted median of values that are not NaN, and its error."""
     known = np.isfinite(values)
     values, weights = values[known], errors[known] ** -2.0
     n = len(values)
     if not n:
-        return np.nan, np.nan, np.nan
+        return np.nan, np.nan
     order = np.argsort(values)
     share = np.cumsum(weights[order]) - weights[order] / 2.0
     middle = float(np.interp(weights.sum() / 2.0, share, values[order]))
     if n < 3:
-        return middle, float(weights.sum() ** -0.5), 0.0
+        return middle, float(weights.sum() ** -0.5)
     scatter = 1.4826 * float(np.median(abs(values - middle))) * np.sqrt(np.pi / 2.0 / n)
-    return middle, max(np.sqrt(np.pi / 2.0 / weights.sum()), scatter), scatter
+    return middle, max(float(np.sqrt(np.pi / 2.0 / weights.sum())), scatter)
 
 
 def _photometry(scene: Scene, radius: float) -> tuple[Array, Array]:
