@@ -145,6 +145,7 @@ def test_fields_must_serve_all_images():
     [
         ({}, None, True),
         ({"transforms": [np.eye(2, 3), [[0, -1, N - 1], [1, 0, 0]]]}, None, True),
+        ({"components": {"line": [1, 0], "continuum": [1, 1]}}, None, True),
         ({"halos": [np.ones((N, N))]}, None, False),
         ({"halos": [np.ones((N, N))]}, 48, True),  # which is refused
     ],
