@@ -181,8 +181,8 @@ def deconvolve(
 
         Cores are flat at their top, 0, or wrapped round (`lnocl.core.scene.saturation`). Cosmic
         rays are sharper than the PSF (`lnocl.core.scene.blemishes`). Exposures of several images of
-        one epoch are multiplied by the factor that all stars show, where it is significant
-        (`lnocl.core.scene.zero_points`); the image in the middle keeps its own. A line of the log
+        a filter are multiplied by the factor that all stars show, where it is significant
+        (`lnocl.core.scene.zero_points`); those in the middle keep their own. A line of the log
         and the plan of the result say what was mended.
     checkpoint : str or path, optional
         File for the state of the run (FITS), saved after the first iterations, every minute and at

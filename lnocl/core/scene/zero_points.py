@@ -48,11 +48,14 @@ class ZeroPoints(NamedTuple):
         NaN where an image shows no star well.
     n_stars : int
         Stars that they are measured on.
+    varying : ndarray of float64, shape (p,)
+        The errors where stars vary as they do against each other.
     """
 
     values: Array
     errors: Array
     n_stars: int
+    varying: Array
 
 
 def zero_points(scene: Scene) -> ZeroPoints | None:
@@ -67,46 +70,46 @@ def zero_points(scene: Scene) -> ZeroPoints | None:
 
 def _joined(n: int, found: Sequence[tuple[Sequence[int], ZeroPoints]]) -> ZeroPoints:
     """Return the zero points of n images from those of some."""
-    values, errors = np.zeros((2, n))
+    values, errors, varying = np.zeros((3, n))
     for images, of in found:
-        values[images], errors[images] = of.values, of.errors
-    return ZeroPoints(values, errors, max(of.n_stars for _, of in found))
+        values[images], errors[images], varying[images] = of.values, of.errors, of.varying
+    return ZeroPoints(values, errors, max(of.n_stars for _, of in found), varying)
 
 
 def _of_one_filter(scene: Scene) -> ZeroPoints | None:
     fewest = FEWEST if scene.n_epochs > 1 else 1
     # Few stars lie so far from others that the largest circle tells of them.
-    least, may_vary = (fewest, fewest, 1), (False, scene.n_epochs > 1, False)
-    measured = [_measured(scene, *each) for each in zip(CIRCLES, least, may_vary, strict=True)]
+    measured = [_measured(scene, *each) for each in zip(CIRCLES, (fewest, fewest, 1), strict=True)]
     found = [each for each in measured if each is not None]
     if len(found) < len(CIRCLES):
         return None
     core, middle, large = found
+    errors = middle.varying if scene.n_epochs > 1 else middle.errors
     with np.errstate(invalid="ignore"):
-        is_used = abs(middle.values) > np.maximum(LEAST, LIKELY * middle.errors)
+        is_used = abs(middle.values) > np.maximum(LEAST, LIKELY * errors)
         for each, share in zip((core, large), ALIKE, strict=True):
             apart = APART * np.hypot(each.errors, middle.errors)
             change = abs(each.values - middle.values)
             is_used &= change < np.maximum(share * abs(middle.values), apart)
-        is_sure = is_used.copy()
-        for each in (middle, large):
-            is_sure &= abs(each.values) > np.maximum(LEAST, SIGNIFICANT * each.errors)
+        is_sure = is_used & (abs(middle.values) > SIGNIFICANT * errors)
+        is_sure &= abs(large.values) > np.maximum(LEAST, SIGNIFICANT * large.errors)
     if not is_sure.any():
         return None
-    return middle._replace(values=np.where(is_used, middle.values, 0.0))
+    return middle._replace(values=np.where(is_used, middle.values, 0.0), errors=errors)
 
 
-def _measured(scene: Scene, radius: float, fewest: int, may_vary: bool) -> ZeroPoints | None:
+def _measured(scene: Scene, radius: float, fewest: int) -> ZeroPoints | None:
     """Return the zero points in circles of so many widths, of images of so many good stars or more.
 
-    None where no star shows two. Where stars may vary errors hold that.
+    None where no star shows two.
     """
     fluxes, variances = _photometry(scene, radius)
     with np.errstate(invalid="ignore", divide="ignore"):
         relative = np.sqrt(variances) / fluxes
         is_good = (fluxes > 0) & (relative < FAINTEST)
-    is_good[is_good.sum(axis=1) < fewest] = False
-    is_good[:, is_good.sum(axis=0) < 2] = False
+    for _ in is_good:  # a star in one image tells nothing, and an image may then have too few
+        is_good[:, is_good.sum(axis=0) < 2] = False
+        is_good[is_good.sum(axis=1) < fewest] = False
     brightest = np.argsort(np.where(is_good, relative, np.inf).min(axis=0))[:MOST_STARS]
     stars = brightest[is_good[:, brightest].any(axis=0)]
     if not len(stars):
@@ -119,43 +122,47 @@ def _measured(scene: Scene, radius: float, fewest: int, may_vary: bool) -> ZeroP
         of_stars = np.nanmedian(logs - values[:, None], axis=0)
         found = [_middle(each - of_stars, error) for each, error in zip(logs, errors, strict=True)]
         values = np.array([each[0] for each in found])
-    middles = np.array([each[1] for each in found])
-    if may_vary:
-        middles *= _varying(logs - of_stars, errors)
-    return ZeroPoints(values - np.nanmedian(values), middles, len(stars))
+    formal, scatters = np.array(found)[:, 1:].T
+    varying = np.fmax(scatters, formal * _varying(logs - of_stars, errors))
+    values -= np.nanmedian(values)
+    return ZeroPoints(values, np.fmax(formal, scatters), len(stars), varying)
 
 
 def _varying(values: Array, errors: Array) -> float:
     """Return by how much larger errors of zero points are as stars vary from image to image.
 
-    Pairs of stars tell that, whatever the zero points are.
+    Pairs of stars tell that, whatever the zero points are. Values are relative to the middle one of
+    each star, errors without that.
     """
     from scipy.stats import norm, t  # a third of a second, for several epochs
 
-    n_images, n_stars = values.shape
-    ones, others = np.triu_indices(n_stars, 1)
-    apart = abs(values[:, ones] - values[:, others]) / np.hypot(errors[:, ones], errors[:, others])
-    freedom = max(int(np.isfinite(values).sum()) - n_images - n_stars + 1, 1)
-    if not np.isfinite(apart).any() or n_images == 1:
+    seen = np.isfinite(values)
+    of_star, n_images = seen.sum(axis=0), np.count_nonzero(seen.any(axis=1))
+    apart_by = values * np.sqrt(of_star / (of_star - 1.0))  # each is 2 or more
+    ones, others = np.triu_indices(values.shape[1], 1)
+    apart = abs(apart_by[:, ones] - apart_by[:, others])
+    apart /= np.hypot(errors[:, ones], errors[:, others])
+    freedom = int(seen.sum()) - n_images - values.shape[1] + 1
+    if freedom < 1 or not np.isfinite(apart).any():
         return np.inf
-    scatter = np.nanmedian(apart) / norm.ppf(0.75) * np.sqrt(n_images / (n_images - 1.0))
-    return float(max(scatter, 1.0) * t.isf(norm.sf(SIGNIFICANT), freedom) / SIGNIFICANT)
+    scatter = max(np.nanmedian(apart) / norm.ppf(0.75), 1.0)
+    return float(scatter * t.isf(norm.sf(SIGNIFICANT), freedom) / SIGNIFICANT)
 
 
-def _middle(values: Array, errors: Array) -> tuple[float, float]:
-    """Return the weighted median of values that are not NaN, and its error."""
+def _middle(values: Array, errors: Array) -> tuple[float, float, float]:
+    """Return the weighted median of values that are not NaN, its error, and that by scatter."""
     known = np.isfinite(values)
     values, weights = values[known], errors[known] ** -2.0
     n = len(values)
     if not n:
-        return np.nan, np.nan
+        return np.nan, np.nan, np.nan
     order = np.argsort(values)
     share = np.cumsum(weights[order]) - weights[order] / 2.0
     middle = float(np.interp(weights.sum() / 2.0, share, values[order]))
     if n < 3:
-        return middle, float(weights.sum() ** -0.5)
+        return middle, float(weights.sum() ** -0.5), 0.0
     scatter = 1.4826 * float(np.median(abs(values - middle))) * np.sqrt(np.pi / 2.0 / n)
-    return middle, max(float(np.sqrt(np.pi / 2.0 / weights.sum())), scatter)
+    return middle, float(np.sqrt(np.pi / 2.0 / weights.sum())), scatter
 
 
 def _photometry(scene: Scene, radius: float) -> tuple[Array, Array]:
