@@ -19,6 +19,7 @@ from lnocl.core.runs.plan import plan as make_plan
 from lnocl.core.runs.preparation import Prepared, prepare
 from lnocl.core.runs.start import Setup
 from lnocl.core.scene.arrays import Array, together, whole
+from lnocl.core.scene.components import refuse_unseen
 from lnocl.core.scene.counts import mean_exposure, means
 from lnocl.core.scene.grid import psf_shape
 from lnocl.core.scene.observation import Observation
@@ -38,8 +39,9 @@ from lnocl.tiling import Span, Tile, cut, lay
 # Of those of `lnocl.deconvolve`, beside parameters.
 OPTIONS = {"solver", "precision", "engine", "device", "pad", "refine_positions", "refine_psfs"}
 OPTIONS |= {"mend_images", "spectral_smoothing"}
-# The tiles with the brightest extended source, of whose choices that in the middle is taken.
-N_CHOOSING = 3
+# The tiles with the brightest extended source, of whose choices that in the middle is taken, and
+# the share of the light of the brightest that each has.
+N_CHOOSING, FAIR = 3, 0.3
 # Warnings of tiles that are given in full.
 MAX_WARNINGS = 3
 
@@ -246,6 +248,11 @@ def deconvolve_tiles(
     prepared = prepare(plan, progress)
     observation, near_stars = prepared.setup.observation, prepared.penalties[0].near_stars
     observed = [*filter(None, (cut(observation, positions, near_stars, at) for at in tiles))]
+    for each in observed:
+        try:
+            refuse_unseen(each.observation)
+        except InputError as error:
+            raise InputError(f"{_begins(each)}: {error.message}, or give a larger `tile`") from None
     or_dark = " or that is behind a `transmission` of 0" if len(observation.transmission) else ""
     for x, y in np.delete(positions, np.concatenate([each.numbers for each in observed]), axis=0):
         raise InputError(
@@ -304,7 +311,12 @@ def _choose(tiles: Sequence[Tile], parallel: Parallel, prepared: Prepared) -> Re
 
     One tile alone may be misled (docs/validation/tiles.md).
     """
-    brightest = sorted(tiles, key=_light)[-N_CHOOSING:]
+    lights = np.array(list(map(_light, tiles)))
+    brightest = [
+        tiles[k]
+        for k in np.argsort(lights)[-N_CHOOSING:].tolist()
+        if lights[k] >= FAIR * lights.max()
+    ]
     with closing(work(partial(partial, _choice, prepared), brightest, parallel)) as answers:
         choices = sorted(answers, key=lambda each: each.n_iter)
     return choices[len(choices) // 2]
@@ -323,28 +335,33 @@ def _alone(result: Result, **changes: Any) -> Result:
 
 def _outcome(prepared: Prepared, tile: Tile) -> Outcome:
     prepared = prepared.of(tile.observation, tile.stars).penalised(near_stars=tile.near_stars)
-    outcome = reconstruct(prepared, own=tile.own, within=tile.core)
+    try:
+        outcome = reconstruct(prepared, own=tile.own, within=tile.core)
+    except InputError as error:
+        raise InputError(f"{_begins(tile)}: {error.message}") from error
     if prepared.is_within and len(tile.stars):
         outcome = outcome.marginal(stars=True, halos=False, levels=False)
     return replace(outcome, psf_refinement=prepared.refinement)
 
 
-def _solve(prepared: Prepared, tile: Tile) -> _Found:
-    from lnocl.core.solvers.light import Light  # which loads scipy
-
-    tile = tile.without_unseen_neighbours()
-    begins = "tile that begins at pixel ({1}, {0}), where positions there begin".format(
+def _begins(tile: Tile) -> str:
+    return "tile that begins at pixel ({1}, {0}), where positions there begin".format(
         *(span.window.start for span in tile.spans)
     )
+
+
+def _solve(prepared: Prepared, tile: Tile) -> _Found:
+    from lnocl.core.solvers.light import Light, fluxes_of_filters  # which load scipy
+
+    tile = tile.without_unseen_neighbours()
+    begins = _begins(tile)
     with recorded_warnings() as recorded:
-        try:
-            outcome = _outcome(prepared, tile)
-        except InputError as error:
-            raise InputError(f"{begins}: {error.message}") from error
+        outcome = _outcome(prepared, tile)
         errors = outcome.star_errors()
     result, (y, x), at_stars = make_result(outcome), tile.spans, outcome.star_residuals()
     within = np.zeros(tile.observation.sky_shape)
     within[tile.core] = 1.0
+    lights = [Light(part.estimate) for part in outcome.estimate.parts]
     own, numbers = (_in_epochs(each, tile.observation) for each in (tile.own, tile.numbers))
     positions = result.star_positions + np.array([x.window.start, y.window.start])
     return _Found(
@@ -352,12 +369,7 @@ def _solve(prepared: Prepared, tile: Tile) -> _Found:
         (x.core.start, y.core.start, len(x.core), len(y.core), *result.history[-1]),
         np.array(list(outcome.models())),
         outcome.pixel_noise() if result.component_names else None,
-        np.array(
-            [
-                Light(part.estimate).flux(within, errors.fluxes[part.fluxes])
-                for part in outcome.estimate.parts
-            ]
-        ),
+        fluxes_of_filters(outcome.estimate, lights, within, errors.fluxes),
         numbers,
         np.column_stack([positions, result.star_fluxes, errors.fluxes, errors.positions])[own],
         errors.covariances[tile.own],
@@ -371,7 +383,7 @@ def _solve(prepared: Prepared, tile: Tile) -> _Found:
 
 
 def _light(tile: Tile) -> float:
-    """Return the counts above the background but for those within half a PSF of a star.
+    """Return the counts above the background in the core, but those within half a PSF of a star.
 
     Bright stars mislead the choice, most of all where PSFs are not quite right: both halves of the
     counts share their residuals.
@@ -382,6 +394,10 @@ def _light(tile: Tile) -> float:
     reach = max(psf_shape(observation)) / (2.0 * observation.oversample)
     rows, columns = (np.arange(n) for n in observation.shape)
     for j, image in enumerate(light):
+        at = observation.geometry.on_sky(j, columns, rows[:, None])
+        for place, own in zip(at, tile.core[::-1], strict=True):
+            on_sky = observation.oversample * (place + 0.5)
+            image[~((on_sky >= own.start) & (on_sky < own.stop))] = 0.0
         for x, y in observation.places(j, tile.stars):
             near = np.ix_(abs(rows - y) <= reach, abs(columns - x) <= reach)
             image[near] = 0.0

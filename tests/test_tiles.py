@@ -442,6 +442,33 @@ def test_stars_beyond_a_tile_do_not_choose_for_it():
     assert errors[1] < 1.2 * errors[0]
 
 
+def test_tiles_with_a_fair_share_of_the_light_choose(monkeypatch):
+    """A source at the corner of four tiles is in the margins of three, whose parts are blank."""
+    light = np.zeros((N, N))
+    light[40:62, 40:62] = 100.0
+    counts = np.random.default_rng(1).poisson(5.0 + light)
+    observation = lnocl.Observation(counts, vary(0.0, 0.0), background=5.0, psf_error=0)
+    choice, chosen_by = tiles._choice, []
+    monkeypatch.setattr(tiles, "_choice", lambda *a: chosen_by.append(a[1].core) or choice(*a))
+    found = lnocl.deconvolve_tiles(observation, tile=96, pad=4, engine="numpy", n_iter=10)
+    assert len(found.tiles) == 4
+    assert chosen_by == [(slice(0, 64), slice(0, 64))]
+
+
+def test_tiles_beyond_the_frame_of_the_sky_have_no_light_to_choose_by():
+    """They stand for nothing of it."""
+    turns = [np.eye(2, 3), [[1, 0, 40], [0, 1, 40]]]
+    images = np.random.default_rng(3).poisson(100.0, (2, 120, 120))
+    frames = [images[0, :40, :40], images[1]]
+    observation = lnocl.Observation(frames, np.ones((21, 21)), background=5.0, transforms=turns)
+    laid = tiling.lay(observation.upright(), 64, 4)
+    cuts = [tiling.cut(observation.upright(), np.zeros((0, 2)), None, spans) for spans in laid]
+    shown = [np.prod([at.stop - at.start for at in tile.core]) for tile in cuts]
+    assert 0 < np.count_nonzero(shown) < len(cuts)
+    for tile, n_pixels in zip(cuts, shown, strict=True):
+        assert tiles._light(tile) == pytest.approx(2 * 95.0 * n_pixels, rel=0.05, abs=0.0)
+
+
 def test_light_of_stars_makes_no_tile_bright():
     observation, _ = make_frame(n_stars=0)
     images = observation.images.copy()

@@ -96,7 +96,7 @@ def from_parts(
     with ignored_warnings():  # which the run has given
         known: dict[str, Any] = {"stars": prior}
         for name in ("shares", "edges"):  # text where there are none
-            each = parts[f"penalty.{name}"]
+            each = parts.get(f"penalty.{name}", np.array(""))
             known[name] = tuple(each.tolist()) if each.ndim else ()
         scene = setup.scene(_built(Penalty, parts, "penalty.", **known))
         if setup.refine_positions and scene.n_stars:

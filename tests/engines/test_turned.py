@@ -544,7 +544,7 @@ def test_a_flat_sky_is_as_bright_as_pixels_are_large():
     flat = np.array([9.0, 9.0, 9.0 * 1.7**2])
     images = np.broadcast_to(flat[:, None, None], (3, NY, NX)) + 4.0
     scene = Scene(observation(maps, images=images, background=4.0))
-    assert scene.level == pytest.approx(9.0, rel=1e-12)
+    assert scene.levels == pytest.approx(9.0, rel=1e-12)
     result = paper(scene.observation, n_iter=20, engine="numpy")
     assert worst(result.models()[2][~scene.observation.mask[2]], 9.0 * 1.7**2 + 4.0) <= 0.021
 

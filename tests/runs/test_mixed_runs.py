@@ -499,3 +499,38 @@ def test_only_filters_whose_stars_surely_lie_elsewhere_are_moved(monkeypatch):
     np.testing.assert_array_equal(moved((0.3, 0.2, 0.01), (0.25, 0.22, 0.001)), stays)
     np.testing.assert_array_equal(moved((0.3, 0.2, 0.2), (0.25, 0.9, 0.01)), stays)
     np.testing.assert_array_equal(moved((0.0, 0.0, np.inf), (0.25, 0.9, 0.01)), stays)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_light_that_one_filter_alone_shows_is_of_no_component(seed):
+    """Beside the images of a filter its sky is as bright as it began, and so were components."""
+    mask = np.zeros((2, *SHAPE), bool)
+    mask[0, :, :14] = True
+    images = np.random.default_rng(seed).poisson(models(fluxes=(0.0, 0.0)))
+    observation = observe().replace(images=np.where(mask, 0, images), mask=mask)
+    result = lnocl.deconvolve(observation, **FIXED | {"n_iter": 100}, smoothing=0.01)
+    flux, error = result.extended_flux
+    told = np.array([sky[:, 13:].sum() for sky in (LINE, CONTINUUM)])
+    # A column at the mask's edge is seen in part.
+    edge = np.array([sky[:, 13].sum() for sky in (LINE, CONTINUUM)])
+    assert (abs(flux - told + edge / 2.0) < 3.0 * error + edge / 2.0).all()
+    noise = result._findings.pixel_noise()
+    assert np.isnan(noise[0, :, :8]).all()
+    assert np.isfinite(noise[0, :, 16:]).all()
+    assert np.isfinite(noise[1]).all()
+
+
+def test_a_filter_that_no_good_pixel_shows_is_refused():
+    mask = np.zeros((2, *SHAPE), bool)
+    mask[0] = True
+    given = observe().replace(images=np.where(mask, 0, 50), mask=mask)
+    with pytest.raises(
+        InputError, match=r"^no good pixel shows line \+ continuum: leave its images"
+    ):
+        lnocl.deconvolve(given, **FIXED)
+    mask[0, :, 24:] = False
+    given = observe().replace(images=np.where(mask, 0, 50), mask=mask)
+    with pytest.raises(
+        InputError, match=r"pixel \(0, 0\), where .* no good pixel shows .* a larger"
+    ):
+        lnocl.deconvolve_tiles(given, tile=24, pad=0, **FIXED)

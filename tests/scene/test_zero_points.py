@@ -1,10 +1,13 @@
 """Zero points of images are told by their stars, and wrong PSFs are not taken for them."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from test_saturation import lopsided
 
 import lnocl
+from lnocl.core.scene import zero_points as module
 from lnocl.core.scene.scene import Scene
 from lnocl.core.scene.zero_points import zero_points
 
@@ -128,6 +131,37 @@ def test_clouds_of_a_few_nights_are_told_by_four_stars_of_which_one_varies():
     observation = lnocl.Observation(images, psf, background=LEVEL, epochs=range(8))
     found = zero_points(Scene(observation, stars))
     np.testing.assert_allclose(found.values, np.log(clear), atol=0.015)
+
+
+@pytest.mark.parametrize(("n_stars", "spread"), [(4, 0.0), (30, 0.05)])
+@pytest.mark.parametrize("blank", [0, 30])
+def test_variation_counts_once_and_blank_nights_not(monkeypatch, n_stars, spread, blank):
+    """Of photometry that is drawn: of nights of which one has a cloud, some without stars."""
+    rng = np.random.default_rng(n_stars)
+    fluxes = 1e4 * np.exp(spread * rng.standard_normal((10, n_stars)))
+    fluxes[3] *= 0.8
+    fluxes = np.concatenate([fluxes, np.full((blank, n_stars), np.nan)])
+    drawn = (fluxes * (1.0 + 0.003 * rng.standard_normal(fluxes.shape)), (0.003 * fluxes) ** 2)
+    monkeypatch.setattr(module, "_photometry", lambda *_: drawn)
+    n = len(fluxes)
+    found = zero_points(SimpleNamespace(mixing=None, n_epochs=n, n_images=n))
+    assert found.values[3] == pytest.approx(np.log(0.8), abs=3.0 * found.errors[3])
+    assert found.errors[3] < 2.0 * np.hypot(spread, 0.006) * np.sqrt(np.pi / 2.0 / n_stars)
+
+
+def test_an_image_of_one_star_that_others_show_too_tells_nothing(monkeypatch):
+    """Of three stars of a night two are seen in no other: the third may vary."""
+    logs = 10.0 + 0.004 * np.random.default_rng(0).standard_normal((8, 8))
+    logs[1:, 6:] = logs[0, 1:6] = np.nan
+    logs[0, 0] -= 0.3
+    drawn = np.exp(logs), (0.004 * np.exp(logs)) ** 2
+    monkeypatch.setattr(module, "_photometry", lambda *_: drawn)
+    assert zero_points(SimpleNamespace(mixing=None, n_epochs=8, n_images=8)) is None
+    logs[1] = np.where(np.arange(8) < 6, np.nan, 10.0)  # and two of them in one that has no other
+    drawn = np.exp(logs), (0.004 * np.exp(logs)) ** 2
+    found = module._measured(None, 1.0, 3)
+    assert np.isnan(found.values[:2]).all()
+    assert np.isfinite(found.values[2:]).all()
 
 
 @pytest.mark.parametrize("seed", range(10))

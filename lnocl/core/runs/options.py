@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from lnocl.core.scene.arrays import Array, flag, numbers, whole
+from lnocl.core.scene.components import refuse_unseen
 from lnocl.core.scene.containers import counts
 from lnocl.core.scene.observation import Observation
 from lnocl.core.scene.psf_families import FAMILIES
@@ -40,18 +41,19 @@ ROUNDING_WORTH_A_WARNING = 1e-3
 
 
 def check_observation(observation: object) -> None:
-    """Refuse anything but an `Observation`.
+    """Refuse anything but an `Observation`, and one in which no good pixel shows a filter.
 
     Raises
     ------
     InputError
-        `observation` is not an Observation.
+        `observation` is not an Observation; a filter is not seen.
     """
     if not isinstance(observation, Observation):
         raise InputError(
             f"observation is of type {type(observation).__name__}; give an lnocl.Observation, as "
             "lnocl.Observation(images, psfs) makes"
         )
+    refuse_unseen(observation)
 
 
 def check_choices(solver: str, precision: str, engine: str, device: object) -> None:

@@ -180,13 +180,15 @@ def _light_within(aperture: Aperture, cutouts: Sequence[Cutout], grid: tuple[int
 
 def _observed(scene: Scene) -> Array:
     """Return 1 where the extended source was observed, else 0."""
-    observed = np.ones(scene.grid)
-    if scene.weights is not None:
-        model = Model(scene)
-        observed = observed * scene.observed(model.adjoint(model.weights))
     ny, nx = scene.observation.sky_shape
-    seen = observed if observed.ndim == 2 else observed.min(axis=0)
-    return seen[:ny, :nx]
+    observed = np.ones((ny, nx))
+    if scene.weights is None:
+        return observed
+    parts = [scene] if scene.mixing is None else map(scene.of_images, scene.mixing.images)
+    for part in parts:  # what one filter alone shows tells no component
+        model = Model(part)
+        observed *= part.observed(model.adjoint(model.weights))[:ny, :nx]
+    return observed
 
 
 def _note(aperture: Aperture, scene: Scene, width: float, observed: Array) -> str:

@@ -149,6 +149,15 @@ def in_filters(
     return numbers_of.ravel().astype(np.intp), tuple(texts)
 
 
+def refuse_unseen(observation: Observation) -> None:
+    """Refuse an observation in which no good pixel shows a filter."""
+    if (mixing := observation.mixing) is None:
+        return
+    for name, images in zip(mixing.filter_names, mixing.images, strict=True):
+        if observation.mask[images].all():
+            raise InputError(f"no good pixel shows {name}: leave its images and components out")
+
+
 def _by_name(parameter: str, value: Mapping[Any, Any], n_images: int) -> Array:
     """Return the numbers of each name in each image, shape (p, K)."""
     columns = []

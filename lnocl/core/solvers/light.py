@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lnocl.core.scene.arrays import Array
-from lnocl.core.scene.camera import images_of, is_flat
+from lnocl.core.scene.camera import adjoints_of, images_of, is_flat
 from lnocl.core.scene.components import Mixing
 from lnocl.core.scene.detector import on_sky, psfs_on_detector
 from lnocl.core.scene.estimate import Estimate
@@ -31,6 +31,12 @@ from lnocl.core.scene.forward_model import Model
 from lnocl.core.scene.observation import Observation
 from lnocl.core.scene.transforms import enlarged
 from lnocl.core.solvers.levels import Levels
+
+# A pseudo-inverse holds this, relatively, for 0.
+NOTHING = 1e-9
+# A pixel is well seen of whose light good pixels have this share of what they have of the best one:
+# in the corner of an image a quarter is left.
+SEEN = 0.2
 
 
 class Light:
@@ -54,6 +60,18 @@ class Light:
         else:
             observed = scene.observed(total)
             self._per_weight = np.divide(1.0, total, out=np.zeros(scene.grid), where=observed)
+
+    @property
+    def observed(self) -> NDArray[np.bool_]:
+        """Where an image sees the sky well, shape (ny, nx)."""
+        ny, nx = self._scene.observation.sky_shape
+        if is_flat(self._per_weight):
+            return np.ones((ny, nx), bool)
+        found = np.zeros((ny, nx), bool)
+        for camera, weights in zip(self._map.cameras, self._map.weights, strict=True):
+            seen = adjoints_of([camera], [(weights > 0) * 1.0], np.ones((1, 1)))[0]
+            found |= seen[:ny, :nx] > SEEN * seen.max()
+        return found
 
     def _left(self) -> Iterator[Array]:
         """Yield ``(g_j - m_j) / A_j 1``, scaled."""
@@ -166,15 +184,27 @@ class LightOfComponents:
         return self._estimate.observed_sky + self._mixing.components(left)
 
     def flux(self, shares: Array, star_flux_errors: Array) -> tuple[Array, Array]:
-        """Return that of `Light.flux` of each sky, shapes (K,)."""
+        """Return that of `Light.flux` of each sky, shapes (K,), where all filters see it."""
         fluxes, covariance = self.covariance(shares, star_flux_errors)
         return fluxes, np.sqrt(np.diag(covariance))
 
     def covariance(self, shares: Array, star_flux_errors: Array) -> tuple[Array, Array]:
         """Return the sums of `Light.flux` of each sky, (K,), and their covariances, (K, K)."""
-        pairs = zip(self._lights, self._estimate.parts, strict=True)
-        found = [light.flux(shares, star_flux_errors[part.fluxes]) for light, part in pairs]
-        return of_components(self._estimate.scene.observation, *np.array(found).T)
+        found = fluxes_of_filters(self._estimate, self._lights, shares, star_flux_errors)
+        return of_components(self._estimate.scene.observation, *found.T)
+
+
+def fluxes_of_filters(
+    estimate: Estimate, lights: Sequence[Light], shares: Array, star_flux_errors: Array
+) -> Array:
+    """Return that of `Light.flux` of what each filter shows, shape (G, 2), where all see it.
+
+    What one filter alone shows tells no component.
+    """
+    if len(lights) > 1:
+        shares = shares * np.all([light.observed for light in lights], axis=0)
+    pairs = zip(lights, estimate.parts, strict=True)
+    return np.array([light.flux(shares, star_flux_errors[part.fluxes]) for light, part in pairs])
 
 
 def of_components(observation: Observation, sums: Array, errors: Array) -> tuple[Array, Array]:
@@ -210,11 +240,17 @@ def pixel_noise(estimate: Estimate) -> Array:
         told = model.adjoint(
             np.divide(area * weights, each, out=np.zeros(each.shape), where=each > 0)
             for area, weights, each in pairs
-        )[:ny, :nx]
-        told *= scene.scale / scene.unit**2
-        variances.append(np.divide(1.0, told, out=np.full((ny, nx), np.nan), where=told > 0))
+        )
+        is_seen = scene.observed(told)[:ny, :nx] & (told[:ny, :nx] > 0)
+        told = told[:ny, :nx] * (scene.scale / scene.unit**2)
+        variances.append(np.divide(1.0, told, out=np.full((ny, nx), np.nan), where=is_seen))
     undone = np.ones((1, 1)) if observation.mixing is None else observation.mixing.undone
-    noise = np.sqrt(np.einsum("kg,gyx->kyx", undone**2, variances))
+    squares = undone**2 * (abs(undone) > NOTHING * abs(undone).max())
+    terms = (
+        (square * of for square, of in zip(row, variances, strict=True) if square)
+        for row in squares
+    )
+    noise = np.sqrt([sum(each) for each in terms])
     return np.asarray(noise / observation.oversample**2)
 
 
