@@ -150,8 +150,9 @@ def deconvolve_tiles(
 
     All tiles have the same weights and the same δ of the edge-preserving term of each sky, and the
     same number of iterations unless `stop` is a number. Where held-out counts or the discrepancy
-    choose, the three tiles with the brightest extended source do so, held-out counts by their parts
-    without margins. The middle one of their choices serves all.
+    choose, the three tiles with the brightest extended source do so, of those with 0.3 of the light
+    of the brightest or more; held-out counts do by their parts without margins. The middle one of
+    their choices serves all.
 
     Parameters
     ----------
