@@ -69,10 +69,14 @@ def zero_points(scene: Scene) -> ZeroPoints | None:
 
 
 def _joined(n: int, found: Sequence[tuple[Sequence[int], ZeroPoints]]) -> ZeroPoints:
-    """Return the zero points of n images from those of some."""
+    """Return the zero points of n images from those of filters.
+
+    As filters are compared, of two images in the middle the brighter one is taken: clouds dim.
+    """
     values, errors, varying = np.zeros((3, n))
     for images, of in found:
-        values[images], errors[images], varying[images] = of.values, of.errors, of.varying
+        values[images] = of.values - np.quantile(of.values, 0.5, method="higher")
+        errors[images], varying[images] = of.errors, of.varying
     return ZeroPoints(values, errors, max(of.n_stars for _, of in found), varying)
 
 
