@@ -233,8 +233,9 @@ class Measured:
     def extended_flux(self) -> tuple[Any, Any]:
         r"""The light of the extended source in the frame and its standard error, electrons.
 
-        With components they are arrays of shape (K,), of the part of the frame that all filters
-        see, and hold what weights of components may have wrong (`lnocl.core.solvers.light`).
+        With components they are arrays of shape (K,), of the part of the frame in which filters
+        tell them apart, and hold what weights of components may have wrong
+        (`lnocl.core.solvers.light`).
 
         It is the sum of the extended source and of what the residuals have beside it
         (`lnocl.core.solvers.light`), so that it has no bias, and may be negative where there is

@@ -185,3 +185,14 @@ def test_images_of_a_filter_are_as_they_are_alone():
     np.testing.assert_array_equal(joined.psfs[[1, 3]], observation.psfs[[1, 3]])
     assert joined.psf_error == 0.1
     assert joined.component_names == ("line", "continuum")
+
+
+def test_components_are_told_where_enough_filters_see():
+    """Two of three tell line and continuum apart, one alone does not."""
+    mixing = Mixing.of(np.array([[1.0, 1.0], [0.0, 1.0], [0.7, 1.0]]), ["line", "continuum"])
+    seen = np.array(list(np.ndindex(2, 2, 2)), bool).T.reshape(3, 2, 4)
+    told = mixing.told_by(seen)
+    np.testing.assert_array_equal(told, seen.sum(axis=0) >= 2)
+    assert mixing.told_by(np.ones((3, 2, 4), bool)).all()
+    alike = Mixing.of(np.array([[1.0, 1.0], [0.0, 1.0], [0.0, 0.5]]), ["line", "continuum"])
+    assert not alike.told_by(np.array([[[False]], [[True]], [[True]]])).any()

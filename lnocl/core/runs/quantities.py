@@ -179,16 +179,14 @@ def _light_within(aperture: Aperture, cutouts: Sequence[Cutout], grid: tuple[int
 
 
 def _observed(scene: Scene) -> Array:
-    """Return 1 where the extended source was observed, else 0."""
-    ny, nx = scene.observation.sky_shape
-    observed = np.ones((ny, nx))
+    """Return 1 where the extended source was observed, and components are told, else 0."""
+    (ny, nx), mixing = scene.observation.sky_shape, scene.mixing
     if scene.weights is None:
-        return observed
-    parts = [scene] if scene.mixing is None else map(scene.of_images, scene.mixing.images)
-    for part in parts:  # what one filter alone shows tells no component
-        model = Model(part)
-        observed *= part.observed(model.adjoint(model.weights))[:ny, :nx]
-    return observed
+        return np.ones((ny, nx))
+    parts = [scene] if mixing is None else map(scene.of_images, mixing.images)
+    models = map(Model, parts)
+    seen = [each.scene.observed(each.adjoint(each.weights))[:ny, :nx] for each in models]
+    return (seen[0] if mixing is None else mixing.told_by(np.array(seen))).astype(np.float64)
 
 
 def _note(aperture: Aperture, scene: Scene, width: float, observed: Array) -> str:

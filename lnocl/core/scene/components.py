@@ -76,6 +76,17 @@ class Mixing:
         """Return the skies, shape (K, ...), that are nearest to what each filter shows."""
         return np.einsum("kg,g...->k...", self.undone, np.array(of_filters))
 
+    def told_by(self, seen: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """Return where the filters that see a pixel, (G, ny, nx), tell the components apart."""
+        if seen.all():
+            return np.ones(seen.shape[1:], bool)
+        flat = seen.reshape(len(seen), -1)
+        packed = np.packbits(flat, axis=0)
+        _, first, at = np.unique(packed, axis=1, return_index=True, return_inverse=True)
+        rows = self.rows / self.rows.max(axis=0)
+        ranks = [np.linalg.matrix_rank(rows[those], TOLD_APART) for those in flat[:, first].T]
+        return np.asarray((np.array(ranks) == rows.shape[1])[at.ravel()].reshape(seen.shape[1:]))
+
     @property
     def images(self) -> list[list[int]]:
         """The images of each filter."""

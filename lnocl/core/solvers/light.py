@@ -184,7 +184,7 @@ class LightOfComponents:
         return self._estimate.observed_sky + self._mixing.components(left)
 
     def flux(self, shares: Array, star_flux_errors: Array) -> tuple[Array, Array]:
-        """Return that of `Light.flux` of each sky, shapes (K,), where all filters see it."""
+        """Return that of `Light.flux` of each sky, shapes (K,), where filters tell it."""
         fluxes, covariance = self.covariance(shares, star_flux_errors)
         return fluxes, np.sqrt(np.diag(covariance))
 
@@ -197,12 +197,12 @@ class LightOfComponents:
 def fluxes_of_filters(
     estimate: Estimate, lights: Sequence[Light], shares: Array, star_flux_errors: Array
 ) -> Array:
-    """Return that of `Light.flux` of what each filter shows, shape (G, 2), where all see it.
+    """Return that of `Light.flux` of what each filter shows, shape (G, 2), where they tell skies.
 
     What one filter alone shows tells no component.
     """
-    if len(lights) > 1:
-        shares = shares * np.all([light.observed for light in lights], axis=0)
+    if (mixing := estimate.scene.mixing) is not None:
+        shares = shares * mixing.told_by(np.array([light.observed for light in lights]))
     pairs = zip(lights, estimate.parts, strict=True)
     return np.array([light.flux(shares, star_flux_errors[part.fluxes]) for light, part in pairs])
 
