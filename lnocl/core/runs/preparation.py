@@ -18,6 +18,7 @@ from lnocl.core.scene.arrays import Array
 from lnocl.core.scene.components import Mixing
 from lnocl.core.scene.observation import Observation
 from lnocl.core.scene.penalty import Penalty, recommend_smoothings
+from lnocl.core.scene.scene import Scene
 from lnocl.errors import NotFiniteError, detail, note, of_images
 from lnocl.process import ignored_notes, ignored_warnings
 from lnocl.progress import Progress
@@ -127,13 +128,23 @@ def _mended(plan: Plan, setup: Setup, progress: bool) -> Mended:
 def _mended_filter(plan: Plan, setup: Setup, mixing: Mixing, g: int, progress: bool) -> Mended:
     """Return the setup of the images of a filter, as `_mended` does."""
     which, families = mixing.images[g], plan.families
-    own = replace(setup, observation=setup.observation.of_images(which), initial_extended=None)
-    own = replace(own, initial_star_fluxes=None)
+    observation = setup.observation.of_images(which)
+    own = replace(setup, observation=observation, stars=_seen_stars(observation, setup.stars))
+    own = replace(own, initial_extended=None, initial_star_fluxes=None)
     if len(which) == 1 and not plan.is_asked:  # whose place is that of its stars
         families = tuple(name for name in families if name != "shift")
+    if not len(own.stars):  # to fit any to
+        families = ()
     quiet = ignored_notes() if g >= MOST_TOLD else nullcontext()
     with of_images(which, mixing.filter_names[g]), quiet:
         return _mended(replace(plan, setup=own, families=families), own, progress)
+
+
+def _seen_stars(observation: Observation, stars: Array) -> Array:
+    """Return the stars that the images of a filter show: others tell nothing of it."""
+    stars = stars[observation.shows(stars)]
+    with ignored_warnings(), ignored_notes():  # of the PSFs, of which the run tells too
+        return np.asarray(stars[Scene(observation).observes(stars)])
 
 
 def _in_one_place(setup: Setup, mixing: Mixing, found: Sequence[Mended]) -> Setup:

@@ -152,7 +152,7 @@ class Levels:
 
     def covariance_of(self, shares: Sequence[Array]) -> Array:
         """Return the covariance of sums of shares (p, 3) of the levels, scaled."""
-        laid = np.array([self._laid(each) for each in shares])
+        laid = np.reshape(list(map(self._laid, shares)), (len(shares), len(self._covariance)))
         return np.asarray(laid @ self._covariance @ laid.T)
 
     def _laid(self, shares: Array) -> Array:
