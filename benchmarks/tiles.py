@@ -413,7 +413,7 @@ def components():
             counts, psfs, background=30.0, psf_error=0, components=names
         )
         for tile in (None, 180):
-            begun = time.perf_counter()
+            start = time.perf_counter()
             found = (
                 lnocl.deconvolve(observation, stars)
                 if tile is None
@@ -426,7 +426,7 @@ def components():
                 f"errors {errors[0]:.3f} (line) and {errors[1]:.3f}, {found.n_iter} iterations, "
                 f"smoothing {found.smoothing:.3g}; light, in its errors, "
                 f"{np.round((flux - skies.sum(axis=(1, 2))) / error, 1)}; "
-                f"{time.perf_counter() - begun:.1f} s",
+                f"{time.perf_counter() - start:.1f} s",
                 flush=True,
             )
 

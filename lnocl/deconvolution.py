@@ -202,7 +202,7 @@ def deconvolve(
     Raises
     ------
     InputError
-        - `observation` is not an Observation.
+        - `observation` is not an Observation, or no good pixel shows one of its filters.
         - A parameter is out of its range, masked or too large for the precision.
         - A star lies outside the images, two are at one position, or they are not in pixels.
         - The start is not in counts, or is 0 and stays so.

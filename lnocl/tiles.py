@@ -191,8 +191,8 @@ def deconvolve_tiles(
     ------
     InputError
         As `lnocl.deconvolve`; a tile has no room for its margins; an option is not for tiles; the
-        observation has halos; a star is in a tile that all images mask, or that is behind a
-        transmission of 0.
+        observation has halos; no good pixel of a tile shows one of the filters; a star is in a tile
+        that all images mask, or that is behind a transmission of 0.
     LnoclError
         Dask is missing; the workers are lost.
     DeviceError

@@ -95,7 +95,7 @@ def from_parts(
     prior = _built(StarPrior, parts, "penalty.stars.") if has_prior else None
     with ignored_warnings():  # which the run has given
         known: dict[str, Any] = {"stars": prior}
-        for name in ("shares", "edges"):  # text where there are none
+        for name in ("shares", "edges"):  # each is text where there are none
             each = parts.get(f"penalty.{name}", np.array(""))
             known[name] = tuple(each.tolist()) if each.ndim else ()
         scene = setup.scene(_built(Penalty, parts, "penalty.", **known))

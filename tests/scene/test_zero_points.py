@@ -101,7 +101,7 @@ def test_images_of_several_epochs_need_three_stars():
 
 @pytest.mark.parametrize("factors", [[0.6, 1.0, 1.3, 1.3], [0.6, 1.0, 0.7 * 0.6, 1.0]])
 def test_images_are_compared_with_those_of_their_own_filter(factors):
-    """A filter in which all stars are fainter is no cloud."""
+    """Stars that are all fainter in a filter than in another tell of no cloud."""
     stars = np.array([(20.2, 22.0), (50.7, 31.4), (79.3, 40.1)])
     alone = sum(lopsided(*at, (64, 100)) for at in stars)
     images = [np.random.default_rng(3).poisson(LEVEL + 5e4 * each * alone) for each in factors]

@@ -424,7 +424,7 @@ class _Maps:
     answer : ndarray of float64, shape (ny, nx) or (K + m, ny, nx)
         The extended source, and the ratios.
     ratios : ndarray of float64, shape (m, ny, nx)
-        The ratios alone; NaN where there is no continuum.
+        The ratios, which are NaN where there is no continuum.
     """
 
     def __init__(self, outcome: Outcome, width: float) -> None:

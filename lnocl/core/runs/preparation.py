@@ -143,6 +143,8 @@ def _mended_filter(plan: Plan, setup: Setup, mixing: Mixing, g: int, progress: b
 def _seen_stars(observation: Observation, stars: Array) -> Array:
     """Return the stars that the images of a filter show: others tell nothing of it."""
     stars = stars[observation.shows(stars)]
+    if not (len(stars) and observation.mask.any()):
+        return stars
     with ignored_warnings(), ignored_notes():  # of the PSFs, of which the run tells too
         return np.asarray(stars[Scene(observation).observes(stars)])
 
